@@ -41,7 +41,7 @@ from persist_cli.cli.options import (
     TurnOption,
     VerifyOption,
     limit_spinning,
-    refuse_options,
+    refuse_other_options,
     show_version,
     split_names,
 )
@@ -170,6 +170,7 @@ def inspect(
 
 @app.command(context_settings={"allow_interspersed_args": True})
 def finetune(
+    context: typer.Context,
     recipe: Annotated[str, typer.Argument(help="A recipe's name (`persist recipes`) or a YAML file.")],
     overrides: Annotated[list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Settings to change.")] = None,
     data: Annotated[list[Path] | None, typer.Option(help="Data set folder; may be given again.")] = None,
@@ -193,8 +194,8 @@ def finetune(
     if dry_run:
         from persist_cli.doctor.dry_run import run_dry_run
 
-        run_dry_run(recipe, overrides or [], json)
-        return
+        refuse_other_options(context, "recipe overrides dry_run json", "not with --dry-run, which trains nothing")
+        return run_dry_run(recipe, overrides or [], json)
     if json:
         raise PersistError("--json prints the table of --dry-run; give both, or read the run folder's log.jsonl")
     from persist_cli.train.finetune import FinetunePlan, run_finetune
@@ -294,12 +295,12 @@ def memorize(
     from persist_cli.memorize.picture import PictureOptions
 
     if merge:
-        unused = "memory encoder settings checkpoint model complete seed depth depth_model fov size"
-        refuse_options(context, unused, "not with --merge, which joins memories as they are")
-        run_merge([*merge, *(Path(name) for name in data or [])], out, json)
-    else:
-        plan = MemorizePlan(memory, encoder, settings or [], checkpoint, model, complete, seed)
-        run_memorize(data or [], plan, PictureOptions(depth, depth_model, fov, size), out, json)
+        refuse_other_options(
+            context, "data merge out json verify", "not with --merge, which joins memories as they are"
+        )
+        return run_merge([*merge, *(Path(name) for name in data or [])], out, json)
+    plan = MemorizePlan(memory, encoder, settings or [], checkpoint, model, complete, seed)
+    run_memorize(data or [], plan, PictureOptions(depth, depth_model, fov, size), out, json)
 
 
 @app.command()
@@ -346,6 +347,7 @@ def rollout(
 
 @app.command("eval")
 def evaluate(
+    context: typer.Context,
     checkpoints: CheckpointsArgument = None,
     data: Annotated[list[Path] | None, typer.Option(help="Data set of held-out scenes; may be given again.")] = None,
     protocol: Annotated[str, typer.Option(help="revisit, return, long, unseen or later.")] = "revisit",
@@ -379,15 +381,13 @@ def evaluate(
     persist eval runs/none runs/voxel --data runs/houses-test --memories none,voxel --report runs/report
     """
     if compare is not None:
-        return compare_results(compare, json, report)
-    if not data:
-        raise PersistError("give --data DATA (--data sample comes with persist), or --compare A.json B.json")
+        return compare_results(context, compare, json, report)
     from persist_cli.evaluate.evaluate import run_eval
     from persist_cli.evaluate.new_poses import NewPoses
     from persist_cli.evaluate.plan import EvalPlan
 
     plan = EvalPlan(
-        data=tuple(data), protocol=protocol, metrics=split_names(metrics), frames=frames, clips=clips, seeds=seeds,
+        data=tuple(data or ()), protocol=protocol, metrics=split_names(metrics), frames=frames, clips=clips, seeds=seeds,
         memories=None if memories is None else split_names(memories), controls_named=controls is not None, batch=batch,
         controls=split_names(DEFAULT_CONTROLS if controls is None else controls), noise=pose_noise, resample=resample,
         sampling=SamplingOverrides(steps, sampler, guidance, context_noise), training_seeds=training_seeds,
@@ -397,8 +397,9 @@ def evaluate(
     run_eval(checkpoints or [], plan, out, report, json)
 
 
-def compare_results(files: tuple[Path, Path], json: bool, report: Path | None) -> None:
+def compare_results(context: typer.Context, files: tuple[Path, Path], json: bool, report: Path | None) -> None:
     """Compare two files of results."""
+    refuse_other_options(context, "compare json report", "not with --compare, which takes results as they are")
     from persist_cli.evaluate.report.compare import run_compare
 
     run_compare(*files, json, report)
@@ -443,8 +444,7 @@ def recipes(
     if name is None:
         from persist_cli.viewing.listings import show_recipes
 
-        show_recipes(json)
-    else:
-        from persist_cli.viewing.recipe_page import show_recipe
+        return show_recipes(json)
+    from persist_cli.viewing.recipe_page import show_recipe
 
-        show_recipe(name, json)
+    show_recipe(name, json)

@@ -220,6 +220,18 @@ def refuse_options(context: typer.Context, names: str, why: str) -> None:
         raise PersistError(f"{', '.join(given)}: {why}")
 
 
+def refuse_other_options(context: typer.Context, names: str, why: str) -> None:
+    """Raise ``PersistError`` when the command line has other options or arguments than those of some parameters.
+
+    Args:
+        context: the command's.
+        names: names of the parameters that it uses, separated by spaces.
+        why: when the others may be given, which the message ends with.
+    """
+    unused = [parameter.name for parameter in context.command.params if parameter.name not in names.split()]
+    refuse_options(context, " ".join(filter(None, unused)), why)
+
+
 def show_version(show: bool) -> None:
     """Print the version and end the command, when ``show`` is set."""
     if show:

@@ -94,7 +94,7 @@ def run_edit(plan: EditPlan, out: Path, save_edits: Path | None, as_json: bool) 
     if as_json:
         print_json(report | files)
     else:
-        say(summary(report, files))
+        say(summary(report, files, plan.camera is not None))
 
 
 def _check_plan(plan: EditPlan, out: Path) -> None:
@@ -217,7 +217,7 @@ def write_outputs(
     return names
 
 
-def summary(report: Mapping[str, Any], files: Mapping[str, str]) -> str:
+def summary(report: Mapping[str, Any], files: Mapping[str, str], camera_named: bool) -> str:
     """Return what became of the edits, for people."""
     uncovered, count = report["uncovered"], len(report["edits"])
     lines = [f"{count} edit{'s' * (count > 1)} changed {report['changed']:,} cells of {report['scene']}"]
@@ -229,7 +229,8 @@ def summary(report: Mapping[str, Any], files: Mapping[str, str]) -> str:
         for title, change in report["pictures"].items()
     ]
     if "views" not in files:
-        lines.append("no view is drawn; --camera DATA#trajectory:frame says from where, and --checkpoint who draws it")
+        camera = "" if camera_named else "--camera DATA#trajectory:frame says from where, and "
+        lines.append(f"no view is drawn; {camera}--checkpoint names the model that draws it")
     return "\n".join([*lines, *(f"{name.replace('_', ' ')}: {path}" for name, path in files.items())])
 
 

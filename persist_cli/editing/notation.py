@@ -39,10 +39,15 @@ def make_edits(written: Sequence[WrittenEdit], things: Mapping[str, Box] | None,
     edits: list[Edit] = []
     for option, values in written:
         if option == "edits":
-            edits += read_edits(Path(values[0]))
+            edits += [_overwriting(edit) if overwrite else edit for edit in read_edits(Path(values[0]))]
         else:
             edits.append(_make_edit(option, values, things, overwrite))
     return edits
+
+
+def _overwriting(edit: Edit) -> Edit:
+    """Return an edit of a file with the command line's ``--overwrite``."""
+    return edit.model_copy(update={"overwrite": True}) if isinstance(edit, Insert | Move | Copy) else edit
 
 
 def _make_edit(option: str, values: Sequence[str], things: Mapping[str, Box] | None, overwrite: bool) -> Edit:
@@ -110,6 +115,8 @@ def parse_color(text: str) -> tuple[int, int, int]:
 
     try:
         red, green, blue = ImageColor.getrgb(text)[:3]
+        if max(red, green, blue) > 255:
+            raise ValueError
     except ValueError as error:
         raise DataError(f"{text!r} is no colour #rrggbb, nor the name of one; {_color_hint(text)}") from error
     return red, green, blue

@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 from torch import Tensor
 
-from persist_cli.environments.task import Array, Observation
+from persist_cli.environments.task import FARTHEST, Array, Observation
 from persist_cli.errors import PersistError
 
 Indices = int | Iterable[int] | None
@@ -119,6 +119,7 @@ class DepthAndGoal(BaseFeaturesExtractor):  # type: ignore[misc]
     def forward(self, seen: Mapping[str, Tensor]) -> Float[Tensor, "batch 18"]:
         """Return depths and place over 5 m."""
         upper = seen["depth"][:, : seen["depth"].shape[1] // 2]  # below, the floor is the nearest
+        upper = torch.where(upper > 0, upper, FARTHEST)  # 0 is missing, as the sky is
         nearest = upper.amin(1).unflatten(1, (DEPTH_COLUMNS, -1)).amin(2)
         return torch.cat([nearest, seen["goal"]], dim=1) / USUAL_METRES
 

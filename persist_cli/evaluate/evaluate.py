@@ -10,6 +10,7 @@ from typing import Any
 
 from persist_cli.api.checkpoint import PLAIN, reference_checkpoint
 from persist_cli.data.reference import data_folder
+from persist_cli.errors import PersistError
 from persist_cli.evaluate.aggregate import Table, row_results
 from persist_cli.evaluate.cases import Case, cases_json, counts
 from persist_cli.evaluate.columns import column_json, make_columns
@@ -45,7 +46,12 @@ def run_eval(paths: Sequence[Path], plan: EvalPlan, out: Path, report: Path | No
         out: folder of the evaluation.
         report: folder of the report, ``None`` for none.
         json: whether the results are printed as JSON instead of tables.
+
+    Raises:
+        PersistError: when no data are named, or what is named cannot be measured.
     """
+    if not plan.data:
+        raise PersistError("give --data DATA (--data sample comes with persist), or --compare A.json B.json")
     for folder in (out, report):
         if folder is not None:
             check_folder(folder)

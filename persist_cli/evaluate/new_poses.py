@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -31,9 +32,9 @@ class NewPoses:
     degrees: float = NEAR_DEGREES
 
     def check(self) -> None:
-        """Raise ``PersistError`` for a negative distance or angle."""
-        if min(self.metres, self.degrees) < 0:
-            raise PersistError(f"--new-poses {self.metres:g} {self.degrees:g}: neither may be negative")
+        """Raise ``PersistError`` for a distance or angle that is negative or not finite."""
+        if not all(0 <= limit < math.inf for limit in (self.metres, self.degrees)):
+            raise PersistError(f"--new-poses {self.metres:g} {self.degrees:g}: give two finite numbers of at least 0")
 
     @property
     def definition(self) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,6 +20,7 @@ from persist_cli.memorize.memory_file import add_paths, load_memory, load_paths
 from persist_cli.memorize.picture import PictureOptions, is_picture, without_picture, write_picture
 from persist_cli.memorize.sources import Source, common_reference, find_sources
 from persist_cli.plugins import load_plugin, make_encoder, make_memory
+from persist_cli.recipe import MemoryConfig
 from persist_cli.viewing.console import add_task, busy, print_json, print_table, progress, say, watched
 from persist_cli.viewing.map import draw_map
 
@@ -37,7 +39,7 @@ def run_memorize(data: list[str], plan: MemorizePlan, picture: PictureOptions, o
     """
     _check_out(out)
     config, origin = resolve_memory_config(plan)
-    check_imagines(config.name, plan)  # before a picture is written, which replaces others beside the memory
+    check_imagines(config, plan)  # before a picture is written, which replaces others beside the memory
     sources = find_sources(_with_picture(data, picture, out))
     asked = origin is None or plan.checkpoint is not None
     config = with_usual_classes(of_known_cells(config, sources[0].file, asked))
@@ -79,9 +81,12 @@ def _with_picture(data: list[str], options: PictureOptions, out: Path) -> list[s
     return [str(write_picture(Path(pictures[0]), options, out.with_suffix(".frame")))]
 
 
-def check_imagines(kind: str, plan: MemorizePlan) -> None:
-    """Raise ``CheckpointError`` where a memory of this kind is to imagine and is no scene."""
+def check_imagines(config: MemoryConfig, plan: MemorizePlan) -> None:
+    """Raise ``CheckpointError`` where a memory is to imagine that is no scene, or a seed is given for nothing."""
+    kind = config.name
     if issubclass(load_plugin("memory", kind), Scene):
+        if plan.seed is not None and not plan.complete and config.settings.get("model") is None:
+            raise CheckpointError("--seed: this scene has no model that imagines; add --complete or --model")
         return
     if plan.complete:
         raise CheckpointError(f"--complete: a memory of kind {kind!r} imagines nothing; take --memory scene")
@@ -170,9 +175,15 @@ def _save_and_print(
 
 def walking_words(memory: Memory, out: Path, start: str, checkpoint: Path | None) -> str:
     """Return the command that walks in the memory of a picture, by default with the packaged world model."""
-    model = "" if checkpoint is None else f"{checkpoint} "
-    walk = f'--adapter {memory.name} --start {start} --memory {out} --actions "right*6"'
-    return f"walk in it: persist rollout {model}{walk}"
+    model = [] if checkpoint is None else [str(checkpoint)]
+    walk = " ".join(map(_quoted, [*model, "--adapter", memory.name, "--start", start, "--memory", str(out)]))
+    return f'walk in it: persist rollout {walk} --actions "right*6"'
+
+
+def _quoted(word: str) -> str:
+    """A word as a shell takes it; ``#`` within one needs no quotes."""
+    plain = word.replace("#", "")
+    return word if shlex.quote(plain) == plain else shlex.quote(word)
 
 
 def _table_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:

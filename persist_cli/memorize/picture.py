@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -80,7 +81,7 @@ def write_picture(picture: Path, options: PictureOptions, folder: Path) -> Path:
     info = TrajectoryInfo(f"picture/{picture.stem}", matrix, height, width, UP, walking_actions(), source)
     pose = np.diag([1.0, -1.0, -1.0, 1.0])  # level, towards -z
     pose[1, 3] = HEIGHT
-    written = folder / f"{picture.stem}{SUFFIX}"
+    written = folder / f"{re.sub('[#:]', '-', picture.stem)}{SUFFIX}"  # a reference to frames has these signs
     write_trajectory(written, info, [Frame(rgb, depth, pose)])
     for other in Store(folder):
         if other.path != written and other.info.source.get("format") == source["format"]:

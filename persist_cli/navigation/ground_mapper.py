@@ -14,7 +14,7 @@ before what rays passed over: the scene was written with these frames too, and k
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from enum import IntEnum
 
@@ -73,13 +73,15 @@ def knows_floor(info: TrajectoryInfo, body: Body | None) -> bool:
 def body_of(info: TrajectoryInfo) -> Body:
     """Return the body of a trajectory's agent, with the camera height and radius that its source tells.
 
-    ``persist collect`` tells a ``camera_height`` that is not the default. Where nothing is told, as for captures, the
-    defaults of ``Body`` stand. A body is never lower than its camera.
+    ``persist collect`` tells a height that is not the default as ``camera_height`` of ``camera``. Where nothing is
+    told, as for captures, the defaults of ``Body`` stand. A body is never lower than its camera.
 
     Raises:
         DataError: when what is told is no positive number.
     """
-    told = {name: info.source[name] for name in ("camera_height", "radius") if name in info.source}
+    camera = info.source.get("camera")
+    source = {**camera, **info.source} if isinstance(camera, Mapping) else info.source
+    told = {name: source[name] for name in ("camera_height", "radius") if name in source}
     for name, value in told.items():
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < math.inf:
             raise DataError(f"{info.scene}: its source tells a {name} of {value!r}; it must be metres above 0")

@@ -74,7 +74,7 @@ def check_within_reach(
     """
     places = [ground.places(positions.cpu()) for positions in known]
     metres = float((torch.cat([*places, ground.known_places()]) - ground.places(position.cpu())).norm(dim=1).min())
-    if metres > FARTHEST:
+    if not metres <= FARTHEST:  # a place may be no number
         x, y = places[0][0].tolist()
         raise DataError(
             f"{name}: {metres:.0f} m from all that is known, which is too far to plan a way; name a place within "

@@ -42,7 +42,7 @@ def read_goal(text: str, now: Observations, info: TrajectoryInfo) -> Goal:
     """
     if PLACE.match(text):
         return Goal(None, place_of([float(part) for part in text.split(",")], now, info), info.scene)
-    if "#" in text:
+    if "#" in text and not Path(text).is_file():
         return frame_goal(text, info)
     return Goal(fitted(image_of(text), info, text), None, info.scene)
 

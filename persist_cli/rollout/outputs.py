@@ -17,7 +17,7 @@ from persist_cli.api.geometry import near_poses
 from persist_cli.api.memory import Memory
 from persist_cli.api.nearness import NEAR_DEGREES, NEAR_METRES
 from persist_cli.api.observations import Observations
-from persist_cli.io.files import write_json, write_text
+from persist_cli.io.files import empty_folder_aside, remove_leftovers, write_json, write_text
 from persist_cli.metrics import METRICS
 from persist_cli.metrics.metric import FrameMetric, Prediction, Setup
 from persist_cli.rollout.camera_path import Rollout, RolloutPlan
@@ -54,8 +54,12 @@ def write_poses(path: Path, timestamps: Sequence[float], poses: Float[Tensor, "f
     write_text(path, "# timestamp tx ty tz qx qy qz qw\n" + "\n".join(lines) + "\n")
 
 
+CARD = "rollout.json"  # the file that makes a folder a rollout
+
+MEMORY = "memory.safetensors"
+
 # files of some rollouts
-SOMETIMES = ("compare.mp4", "depth.mp4", "map-before.png", "map-after.png", "memory.safetensors")
+SOMETIMES = ("compare.mp4", "depth.mp4", "map-before.png", "map-after.png", MEMORY)
 
 MOST_BLOCKED = 6  # blocked actions that the terminal names
 
@@ -81,9 +85,25 @@ def describe(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, rol
 
 
 def write_outputs(rollout: Rollout, out: Path, figures: dict[str, Any]) -> dict[str, Any]:
-    """Write all files over those of an earlier rollout; return the figures with those against the true frames."""
-    for name in SOMETIMES:
+    """Write all files over those of an earlier rollout, once all are there; return the figures with those of the truth.
+
+    A folder whose files are of two rollouts has no ``rollout.json``. The earlier one's memory goes after all else, as
+    this one may have begun with it.
+    """
+    remove_leftovers(out, CARD)
+    with empty_folder_aside(out / CARD) as aside:
+        figures = write_files(rollout, aside, figures)
+        written = sorted((path.name for path in aside.iterdir()), key=lambda name: (name == CARD, name == MEMORY))
+        (out / CARD).unlink(missing_ok=True)
+        for name in written:
+            (aside / name).replace(out / name)
+    for name in {*SOMETIMES} - {*written}:
         (out / name).unlink(missing_ok=True)
+    return figures
+
+
+def write_files(rollout: Rollout, out: Path, figures: dict[str, Any]) -> dict[str, Any]:
+    """Write all files into an empty folder; return the figures with those against the true frames."""
     start, seen, truth = rollout.path.start, rollout.seen, rollout.path.truth
     if truth is not None:
         against = compare(start, seen, truth, rollout.gives_depth)
@@ -98,7 +118,7 @@ def write_outputs(rollout: Rollout, out: Path, figures: dict[str, Any]) -> dict[
     poses = path_of(rollout)
     write_poses(out / "poses.txt", [float(number) for number in range(len(poses))], poses)
     write_maps(rollout, out)
-    write_json(out / "rollout.json", figures)
+    write_json(out / CARD, figures)
     return figures
 
 
@@ -249,4 +269,4 @@ def write_maps(rollout: Rollout, out: Path) -> None:
                 memory.points(), memory.reference.world_up, {"rollout": path_of(rollout)}, out / f"{name}.png", stops
             )
     if rollout.memory is not None:
-        rollout.memory.save(out / "memory.safetensors", rollout.kept_paths)
+        rollout.memory.save(out / MEMORY, rollout.kept_paths)

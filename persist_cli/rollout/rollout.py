@@ -22,7 +22,7 @@ from persist_cli.io.files import check_folder
 from persist_cli.memorize.memory_file import add_paths, load_paths
 from persist_cli.rollout.camera_path import CameraPath, Rollout, RolloutPlan, plan_camera_paths
 from persist_cli.rollout.open_world import assemble_world
-from persist_cli.rollout.outputs import blocked_words, counted_words, describe, path_of, summary, write_outputs
+from persist_cli.rollout.outputs import CARD, blocked_words, counted_words, describe, path_of, summary, write_outputs
 from persist_cli.rollout.world_model import StepResult, WorldModel
 from persist_cli.viewing.console import add_task, busy, print_json, progress, say, warn
 
@@ -67,16 +67,15 @@ def check_folders(out: Path, branches: int) -> list[Path]:
     """Return the folder of each branch: ``out`` for a single one, or the folders 0, 1, … in it.
 
     Raises:
-        PersistError: when ``out`` cannot be a folder, or would still hold another rollout beside several branches.
+        PersistError: when ``out`` cannot be a folder, or would still hold another rollout beside the new ones.
     """
     check_folder(out)
-    if branches == 1:
-        return [out]
-    folders = [out / str(number) for number in range(branches)]
-    earlier = [path.parent for path in (*out.glob("rollout.json"), *out.glob("*/rollout.json"))]
+    folders = [out] if branches == 1 else [out / str(number) for number in range(branches)]
+    earlier = [path.parent for path in (*out.glob(CARD), *out.glob(f"*/{CARD}"))]
     stale = sorted(path for path in earlier if path not in folders and (path == out or path.name.isdigit()))
     if stale:
-        raise PersistError(f"{stale[0]}: holds a rollout that these {branches} would not replace; take another --out")
+        new = "this one" if branches == 1 else f"these {branches}"
+        raise PersistError(f"{stale[0]}: holds a rollout that {new} would not replace; take another --out")
     return folders
 
 

@@ -14,6 +14,7 @@ from persist_cli.data.augment import Augmentation
 from persist_cli.data.cameras import vertical_view
 from persist_cli.data.clips import ClipDataset, ClipPlan, clip_length
 from persist_cli.data.held_out import trained_scene
+from persist_cli.data.images import crop_resize
 from persist_cli.data.reference import data_folder
 from persist_cli.data.writing_noise import WritingNoise
 from persist_cli.errors import RecipeError
@@ -176,8 +177,12 @@ class Trainer(TrainingLoop[Backbone]):
 
 def scenes_of(clips: ClipDataset) -> TrainingScenes:
     """The scenes of all clips, and the views that cameras have in random windows too."""
-    names = frozenset(trained_scene(file.info) for file in clips.files)
-    views = [vertical_view(file.info, share) for file in clips.files for share in (clips.plan.augmentation.crop, 1.0)]
+    names, crop = frozenset(trained_scene(file.info) for file in clips.files), clips.plan.augmentation.crop
+    views = []
+    for info in (file.info for file in clips.files):
+        size = (info.height, info.width)
+        largest = crop_resize(size, clips.plan.image_size).window[0] / info.height if crop < 1 else 1.0
+        views += [vertical_view(info, crop * largest), vertical_view(info, largest)]
     return TrainingScenes(names, fov=(min(views), max(views)) if views else None)
 
 

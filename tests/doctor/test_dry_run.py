@@ -64,6 +64,7 @@ def test_the_channels_of_an_encoder_are_known_by_the_name_of_its_weights():
 @pytest.mark.parametrize(
     ("arguments", "cause"),
     [(["tiny-stage1", "--json"], "--json prints the table of --dry-run"),
+     (["tiny-stage1", "--dry-run", "--data", "x", "--resume"], "--data, --resume: not with --dry-run"),
      (["tiny-stage1", "--dry-run", "training.stpes=1"], "did you mean 'training.steps'"),
      (["tiny-stage1", "--dry-run", "backbone.settings.height=65"], "must be a multiple of"),
      (["tiny-stage2-voxel", "--dry-run", "memory.encoder_settings={weights: x}", "memory.encoder=dinov2"], "'x'")],

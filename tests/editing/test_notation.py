@@ -57,6 +57,7 @@ def test_a_file_of_edits_holds_what_was_written(tmp_path):
         ("remove", ("1,2,nan:3,4,5",), "'1,2,nan' is not three numbers"),
         ("paint", ("box#1", "oragne"), "'oragne' is no colour #rrggbb, nor the name of one; did you mean 'orange'?"),
         ("paint", ("box#1", "#12"), "for example #ff8000 or orange"),
+        ("paint", ("box#1", "rgb(300,0,0)"), "'rgb(300,0,0)' is no colour #rrggbb"),
         ("move", ("box#1", "1,0"), "--move box#1 1,0: '1,0' is not three numbers"),
         ("insert", ("box", "1,_"), "is not three numbers"),
         ("edits", ("nowhere.json",), "nowhere.json: cannot be read (No such file or directory)"),
@@ -91,3 +92,11 @@ def test_a_damaged_file_of_edits_says_which_edit_is_wrong(tmp_path, text, words)
 def test_a_memory_without_classes_has_no_things_with_names():
     with pytest.raises(DataError, match="this memory has no things with names"):
         parse_box("table#1", None)
+
+
+def test_edits_of_a_file_overwrite_where_the_command_says_so(tmp_path):
+    edits = [made("remove", "table#1"), made("copy", "box#1", "1,0,0"), made("insert", "box", "1,_,2")]
+    write_edits(tmp_path / "edits.json", edits)
+    written = make_edits([WrittenEdit("edits", (str(tmp_path / "edits.json"),))], None, True)
+    assert written[0] == edits[0]
+    assert [edit.overwrite for edit in written[1:]] == [True, True]

@@ -9,6 +9,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+import torch
 
 import persist_cli.environments  # noqa: F401  registers them
 from persist_cli.errors import PersistError
@@ -131,3 +132,14 @@ def test_success_is_that_of_the_agent_in_the_episodes_of_a_seed():
     assert 0 < first < 1  # some goals are behind a wall
     assert rate(30) == first
     assert rate(1) == 0  # a step is not far enough
+
+
+def test_the_sky_is_no_obstacle():
+    space = gymnasium.make(**TRUE, observe_goal="place").observation_space
+    height, width = space["depth"].shape
+    depth = torch.full((1, height, width), 3.0)
+    depth[:, 0] = 0.0  # missing, as where there is no ceiling
+    depth[:, : height // 2, -1] = 0.0
+    seen = DepthAndGoal(space)({"depth": depth, "goal": torch.zeros(1, 2)})[0, :-2] * 5
+    assert seen[:-1].tolist() == pytest.approx([3.0] * (len(seen) - 1))
+    assert seen[-1] >= 3

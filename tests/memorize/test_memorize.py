@@ -135,6 +135,12 @@ def test_memories_that_cannot_be_merged_are_refused_in_one_line(data, tmp_path, 
     assert not (tmp_path / "merged").exists()
 
 
+def test_a_seed_is_refused_where_a_scene_has_no_model(data, tmp_path, capsys):
+    out = ("--memory", "scene", "--seed", 3, "--out", tmp_path / "scene")
+    assert "--seed: this scene has no model that imagines" in failure(capsys, f"{data}#a", *out)
+    assert not (tmp_path / "scene").exists()
+
+
 def test_scenes_that_imagine_in_different_ways_are_merged_and_the_first_one_stays_as_it_imagines(
     data, tmp_path, capsys
 ):

@@ -15,6 +15,7 @@ from persist_cli.api.cells import CellOrigin
 from persist_cli.api.geometry import unproject
 from persist_cli.checkpoints.scene_models import save_scene_model
 from persist_cli.data.reference import parse_reference
+from persist_cli.data.store import Store
 from persist_cli.memorize.build import walking_words
 from persist_cli.memorize.memory_file import load_memory, load_paths
 from persist_cli.viewing.map import draw_map
@@ -129,6 +130,18 @@ def test_the_command_that_walks_in_a_picture_is_printed(hall, tmp_path, capsys):
     assert f"walk in it: persist rollout --adapter scene --start {tmp_path}/hall.frame#hall:0 --memory {out}" in text
     words = walking_words(load_memory(out), out, "hall.frame#hall:0", Path("runs/mine"))
     assert words.startswith("walk in it: persist rollout runs/mine --adapter scene --start hall.frame#hall:0")
+    words = walking_words(load_memory(out), out, "hall.frame#My Hall:0", None)
+    assert " --start 'hall.frame#My Hall:0' --memory " in words
+
+
+def test_a_walk_can_start_at_a_picture_whose_name_has_the_signs_of_a_reference(hall, tmp_path, capsys):
+    picture = tmp_path / "a#b:c.png"
+    picture.write_bytes((hall / "hall.png").read_bytes())
+    start = memorize(
+        capsys, picture, "--memory", "scene", "--depth", hall / "hall.npy", "--out", tmp_path / "scene.safetensors"
+    )["start"]
+    assert start == f"{tmp_path}/scene.frame#a-b-c:0"
+    assert [file.name for file in Store(tmp_path / "scene.frame")] == ["a-b-c"]
 
 
 @pytest.mark.parametrize("option", ["--set memory.model={}", "--model {}"])

@@ -95,3 +95,10 @@ def test_an_edit_of_a_map_that_cannot_be_done_changes_nothing(room, edit, words)
 def test_a_memory_that_cannot_be_edited_says_which_can():
     with pytest.raises(CheckpointError, match="kind 'snapshots' cannot be edited; those of kind scene and voxel can"):
         empty_memory("snapshots").edit([Remove(**BOX)])
+
+
+def test_after_all_was_removed_there_is_nothing_to_edit(room):
+    everything = Remove(low=(-50, -50, -50), high=(50, 50, 50))
+    with pytest.raises(DataError, match=r"^edit 2 .*the memory is empty"):
+        room.edit([everything, Remove(**BOX)])
+    assert len(room.points().positions)

@@ -1,13 +1,15 @@
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 
-from persist_cli.api.memory import FORMAT_VERSION
+from persist_cli.api.memory import FORMAT_VERSION, FrameOfReference
 from persist_cli.api.tokens import MemoryTokens
-from persist_cli.errors import CheckpointError
+from persist_cli.errors import CheckpointError, PersistError
+from persist_cli.plugins import make_encoder, make_memory
 from tests.support.room_views import MEMORIES, empty_memory, observe, room_walk, same_bits, written_memory
-from tests.support.rooms import look
+from tests.support.rooms import UP, look
 
 
 @pytest.mark.parametrize("name", MEMORIES)
@@ -136,3 +138,12 @@ def test_one_memory_takes_frames_of_several_sizes(name):
     wide = observe([look((0.0, 1.4, 0.0), 45.0)], 40, 90)
     memory.write(wide)
     assert len(memory.read(wide.cameras, 20)) == (0 if name == "none" else 20)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [("voxel", {"cell": [math.inf, 1, 1]}), ("map2d", {"cell": [1, math.inf]}), ("points", {"spread": math.inf})],
+)
+def test_a_memory_takes_no_infinite_lengths(name, settings):
+    with pytest.raises(PersistError, match="above 0, not"):
+        make_memory(name, settings, make_encoder("patches", {}), FrameOfReference("room", UP))

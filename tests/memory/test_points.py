@@ -128,3 +128,8 @@ def test_imagined_points_change_no_observed_one_and_give_way_to_observations_nea
     count = dreamt.figures().imagined
     dreamt.write(walk)
     assert dreamt.figures().imagined < count / 4
+
+
+def test_an_image_smaller_than_the_stride_gives_a_point_all_the_same():
+    frame = room_walk(1)
+    assert len(cloud(frame, stride=1000).tensors()["positions"]) == 1

@@ -163,3 +163,11 @@ def test_a_collision_makes_what_is_right_before_the_body_occupied():
     assert cover_at(mapper.map(), 0.0, 0.0) == cover_at(mapper.map(), -0.5, 0.0) == Cover.FREE
     mapper.add_collision(frames.cameras[0], -0.25)
     assert cover_at(mapper.map(), 0.25, 0.0) == Cover.OCCUPIED
+
+
+def test_a_body_is_as_high_as_the_camera_that_collected_its_data():
+    with pytest.raises(DataError, match="camera_height of 0"):
+        body_of(replace(ROOM.info, source={"simulator": "miniworld", "camera": {"camera_height": 0}}))
+    assert body_of(replace(ROOM.info, source={"simulator": "miniworld", "camera": {"camera_height": 0.7}})) == replace(
+        Body(), camera_height=0.7
+    )

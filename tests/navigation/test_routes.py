@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from persist_cli.api.ground import Cover, GroundMap, ground_axes
-from persist_cli.navigation.routes import Distances, distances_to, holding, walkable
+from persist_cli.errors import DataError
+from persist_cli.navigation.routes import Distances, check_within_reach, distances_to, holding, walkable
 
 UP = (0.0, 0.0, 1.0)
 
@@ -76,3 +77,11 @@ def test_a_map_is_enlarged_without_moving_what_it_knows():
     larger = holding(ground, place(-5.0, 7.0))
     assert torch.equal(larger.at(places), ground.at(places))
     assert int(walkable(ground, 0.2).sum()) == int(walkable(larger, 0.2).sum())
+
+
+@pytest.mark.parametrize("x", [math.nan, math.inf, 1e4])
+def test_a_place_that_is_no_place_or_far_from_all_is_refused(x: float) -> None:
+    with pytest.raises(DataError, match="from all that is known"):
+        check_within_reach(
+            "the goal", torch.tensor([x, 0.0, 0.0]).double(), room_with_wall(), [torch.zeros(1, 3).double()]
+        )

@@ -128,7 +128,8 @@ def test_an_image_of_another_size_is_resized_and_said_so(plan, tmp_path, monkeyp
     monkeypatch.setenv("PERSIST_CACHE", str(tmp_path / "cache"))
     cache_random(tmp_path / "cache", "lpips-alex", tensor_shapes(ALEX))
     Image.new("RGB", (100, 80), "red").save(tmp_path / "goal.png")
-    result = plan(goal=tmp_path / "goal.png")
+    (tmp_path / "goal.png").rename(tmp_path / "goal#1.png")
+    result = plan(goal=tmp_path / "goal#1.png")
     assert result.code == 0, result.err
     assert f"resized from 100×80 to {SIZE}×{SIZE} pixels" in result.err
     assert json.loads((tmp_path / "plan/plan.json").read_text())["cost"]["name"] == "lpips"

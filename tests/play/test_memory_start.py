@@ -40,6 +40,12 @@ def test_a_walk_begins_where_the_last_path_of_a_memory_ends(voxel, walks, rememb
     assert play._walkers.lead.memory.figures().observed == load_memory(remembered).figures().observed
 
 
+def test_a_memory_file_needs_no_suffix(voxel, remembered, tmp_path):
+    file = tmp_path / "room"
+    file.write_bytes(remembered.read_bytes())
+    assert open_play(PlayOptions(voxel, StartOptions(str(file)))).shown.images["voxel"].shape == (SIZE, SIZE, 3)
+
+
 def test_a_completed_scene_is_entered_on_open_ground(tmp_path):
     scene = empty_scene()
     scene.add(cell_room())

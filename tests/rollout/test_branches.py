@@ -165,3 +165,6 @@ def test_branches_refuse_a_folder_with_a_rollout_that_they_would_not_replace(per
     assert (result.code, "2: holds a rollout that these 2 would not replace" in result.err) == (1, True)
     assert not (tmp_path / "0").exists()
     assert roll("left", "right", "forward").code == 0
+    result = roll("left")
+    assert (result.code, "0: holds a rollout that this one would not replace" in result.err) == (1, True)
+    assert not (tmp_path / "rollout.json").exists()

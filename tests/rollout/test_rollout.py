@@ -64,6 +64,19 @@ def test_a_rollout_into_the_folder_of_an_earlier_one_replaces_all_of_it(persist,
     assert {p.name for p in out.iterdir()} == {"rgb.mp4", "depth.mp4", "sheet.png", "poses.txt", "rollout.json"}
 
 
+def test_a_rollout_that_cannot_be_written_leaves_the_memory_that_it_began_with(persist, voxel, walks, tmp_path):
+    out = tmp_path / "o"
+    assert roll(persist, voxel, walks, out, "--actions", "left").code == 0
+    kept = (out / "memory.safetensors").read_bytes()
+    (out / "sheet.png").unlink()
+    (out / "sheet.png").mkdir()
+    ended = roll(persist, voxel, walks, out, "--actions", "right", "--memory", out / "memory.safetensors")
+    assert (ended.code, "sheet.png" in ended.err) == (1, True)
+    assert (out / "memory.safetensors").read_bytes() == kept
+    assert not (out / "rollout.json").exists()  # some files are of the second rollout already
+    assert not list(out.glob("*.aside*"))
+
+
 def test_a_memory_file_stays_as_it_was_when_the_rollout_does_not_write(persist, voxel, walks, tmp_path):
     memory = tmp_path / "m.safetensors"
     assert persist("memorize", f"{walks}#0:0-12", "--out", memory).code == 0

@@ -92,7 +92,7 @@ def _apply(tensors: dict[str, Tensor], form: MapForm, edit: Edit) -> tuple[dict[
 
 def _in_box(tensors: Mapping[str, Tensor], form: MapForm, edit: Remove | Paint | Move | Copy) -> Bool[Tensor, " cell"]:
     """Return which cells have their middle in a box seen from above, and are touched by it in height."""
-    if not tensors:
+    if not tensors or not len(tensors[CELLS]):
         raise DataError("the memory is empty")
     lattice, height = form.lattice, form.height_axis
     cells = tensors[CELLS].cpu().double()

@@ -6,13 +6,14 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
-from pydantic import NonNegativeFloat, PositiveFloat
+from pydantic import NonNegativeFloat
 from torch import Tensor
 
 from persist_cli.api.cameras import Cameras
 from persist_memory.grid.grid_memory import GridMemory
 from persist_memory.grid.pooling import GridSettings, Lattice
 from persist_memory.grid.visibility import Views, horizontal_views
+from persist_memory.metres import Metres
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class Map2DSettings(GridSettings):
         eye_height: metres from the ground to the camera; tokens lie that far below the first camera that reads.
     """
 
-    cell: tuple[PositiveFloat, PositiveFloat] = (0.25, 0.25)
+    cell: tuple[Metres, Metres] = (0.25, 0.25)
     eye_height: NonNegativeFloat = 0.0
 
 

@@ -15,11 +15,12 @@ from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float, Int64, UInt8
-from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, PositiveInt
 from torch import Tensor
 
 from persist_cli.api.observations import Observations
 from persist_memory.grid.storage import AXIS_BITS, LIMIT, keys_of_numbers
+from persist_memory.metres import Metres
 
 # Cells are centred on multiples of their size: floors and walls often have round coordinates, and a boundary of
 # cells there would split each of them in two by the noise of depth. The millionth keeps a point that lies exactly on
@@ -53,7 +54,7 @@ class GridSettings:
 
     pooling: Literal["max", "mean"] = "max"
     stride: PositiveInt = 1
-    max_depth: PositiveFloat | None = None
+    max_depth: Metres | None = None
     imagined: Literal["merge", "once"] = "merge"
     least_new: Annotated[float, Field(ge=0, le=1)] = 0.0
     edges: NonNegativeFloat = 0.0

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
-from pydantic import PositiveFloat
 from torch import Tensor
 
 from persist_cli.api.cameras import Cameras
 from persist_memory.grid.grid_memory import GridMemory
 from persist_memory.grid.pooling import GridSettings, Lattice
 from persist_memory.grid.visibility import Views, frustums
+from persist_memory.metres import Metres
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class VoxelSettings(GridSettings):
             takes the middle number and y takes the number of that axis. The grid is never tilted.
     """
 
-    cell: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = (0.25, 1.0, 0.25)
+    cell: tuple[Metres, Metres, Metres] = (0.25, 1.0, 0.25)
 
 
 class VoxelMemory(GridMemory):

@@ -7,7 +7,7 @@ from typing import Self
 
 import torch
 from jaxtyping import Bool, Float, Int64, UInt8
-from pydantic import PositiveFloat, PositiveInt
+from pydantic import PositiveInt
 from torch import Tensor
 from torch.nn import functional
 
@@ -18,6 +18,7 @@ from persist_cli.api.memory import FrameOfReference, MapPoints, Memory, MemoryFi
 from persist_cli.api.observations import Observations, Origin, origins_like
 from persist_cli.api.tokens import MemoryTokens
 from persist_memory.grid.occlusion import covered, without_known
+from persist_memory.metres import Metres
 from persist_memory.validation import (
     ORIGINS,
     Shape,
@@ -46,8 +47,8 @@ class PointCloudSettings:
     """
 
     stride: PositiveInt = 8
-    spread: PositiveFloat = 0.1
-    max_depth: PositiveFloat | None = None
+    spread: Metres = 0.1
+    max_depth: Metres | None = None
 
 
 class PointCloud(Memory):
@@ -153,7 +154,9 @@ class PointCloud(Memory):
     def _points_of(self, frames: Observations, origin: Origin) -> dict[str, Tensor]:
         """The tensors of the points of some frames, empty without any valid depth."""
         stride, device = self.settings.stride, frames.depth.device
-        rows, columns = (torch.arange(stride // 2, size, stride, device=device) for size in frames.depth.shape[1:])
+        rows, columns = (
+            torch.arange(min(stride // 2, size - 1), size, stride, device=device) for size in frames.depth.shape[1:]
+        )
         depth = frames.depth[:, rows[:, None], columns]
         valid = (depth > 0) & (depth <= (self.settings.max_depth or torch.inf))
         if not bool(valid.any()):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -83,7 +84,7 @@ class RowConfig:
     sampling_of: Mapping[str, Sampling] = field(default_factory=dict)
 
     def check(self) -> None:
-        """Raise ``PersistError`` when no memory is named, for an unknown control, and for negative noise."""
+        """Raise ``PersistError`` when no memory is named, for an unknown control, and for bad noise."""
         if not self.memories:
             raise PersistError("name at least one memory, as in --memories none,voxel")
         known = [*CONTROLS, *INTERVENTIONS]
@@ -93,8 +94,10 @@ class RowConfig:
         for name in self.sampling_of:
             if name not in self.memories:
                 raise PersistError(f"--sampling-of {name}: no such memory; {hint(name, list(self.memories))}")
-        if min(self.noise) < 0:
-            raise PersistError(f"the pose noise {self.noise[0]:g} cm, {self.noise[1]:g}° must not be negative")
+        if not all(0 <= deviation < math.inf for deviation in self.noise):
+            raise PersistError(
+                f"--pose-noise {self.noise[0]:g} {self.noise[1]:g}: give two finite numbers of at least 0"
+            )
 
 
 @dataclass(frozen=True)
