@@ -88,6 +88,9 @@ def with_adapter(values: Mapping[str, Any]) -> dict[str, Any]:
     """
     if not values.get("adapter_from"):
         return dict(values)
+    own_memory = values.get("memory") or {}
+    if not isinstance(own_memory, Mapping) or not isinstance(own_memory.get("settings") or {}, Mapping):
+        return dict(values)  # a recipe of them is refused
     checkpoint, name = named_adapter(str(values["adapter_from"]))
     memory = _merged(dataclasses.asdict(adapter_memory(checkpoint, name)), values.get("memory"))
     own = ["memory"] * (memory is None) + ["adapter"] * (values.get("adapter") not in (None, {}))

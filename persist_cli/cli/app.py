@@ -387,12 +387,12 @@ def evaluate(
     from persist_cli.evaluate.plan import EvalPlan
 
     plan = EvalPlan(
-        data=tuple(data or ()), protocol=protocol, metrics=split_names(metrics), frames=frames, clips=clips, seeds=seeds,
+        data=tuple(data or []), metrics=split_names(metrics), frames=frames, clips=clips, seeds=seeds,
         memories=None if memories is None else split_names(memories), controls_named=controls is not None, batch=batch,
         controls=split_names(DEFAULT_CONTROLS if controls is None else controls), noise=pose_noise, resample=resample,
         sampling=SamplingOverrides(steps, sampler, guidance, context_noise), training_seeds=training_seeds,
         sampling_of=SamplingOverrides.by_memory(sampling_of or ()), allow_training_scenes=allow_training_scenes,
-        placement=InferenceOptions.of(dtype, save_memory), new_poses=NewPoses(*new_poses),
+        placement=InferenceOptions.of(dtype, save_memory), new_poses=NewPoses(*new_poses), protocol=protocol,
     )  # fmt: skip
     run_eval(checkpoints or [], plan, out, report, json)
 

@@ -86,6 +86,11 @@ LORA: Final = Change("LoRA", ("lora.rank=64",), 16)
 STAGE2: Final = Strategy((Change("stage 2 only", (), 0),))  # no change but another recipe, that of the next stage
 
 
+def needs_whole(recipe: Recipe) -> bool:
+    """Whether each process predicts by itself in training, or scores what it predicts, which takes the whole model."""
+    return recipe.distill is not None or recipe.adversarial is not None or recipe.data.own_writes > 0
+
+
 def available_changes(recipe: Recipe, machine: Machine, sharded: bool) -> list[Change]:
     """The changes that can make this recipe need less on this machine and are not in force yet."""
     training, cuda = recipe.training, machine.kind == "cuda"
@@ -94,8 +99,8 @@ def available_changes(recipe: Recipe, machine: Machine, sharded: bool) -> list[C
     mixed = of_a_backbone and training.precision == "bf16"
     frozen, half = FROZEN if recipe.stage == "2" else FROZEN_UNSHARDED, training.frozen_precision == "bf16"
     whole = recipe.distill is not None  # each process needs the whole model, with its averages
-    can_shard = transformer and training.optimizer == "adamw" and not (half and frozen.unsharded_only) and not whole
-    can_shard = can_shard and recipe.adversarial is None  # a discriminator scores whole clips of a whole model
+    can_shard = transformer and training.optimizer == "adamw" and not (half and frozen.unsharded_only)
+    can_shard = can_shard and not needs_whole(recipe)
     fsdp = Change(f"FSDP over {machine.devices}", (), 2, (SHARDED,))
     changes: list[tuple[bool, Change]] = [
         (of_a_backbone and not training.vae_slicing, SLICING),
@@ -106,7 +111,7 @@ def available_changes(recipe: Recipe, machine: Machine, sharded: bool) -> list[C
         (not training.gradient_checkpointing and transformer, CHECKPOINTING),
         (training.optimizer == "adamw" and cuda and not sharded, EIGHT_BIT),
         (cuda and can_shard, OFFLOAD),
-        (recipe.stage == "1" and recipe.lora is None and not whole, LORA),
+        (recipe.stage == "1" and recipe.lora is None and not whole and training.optimizer != "muon", LORA),
     ]
     return [change for available, change in changes if available]
 

@@ -22,6 +22,7 @@ from persist_cli.doctor.changes import (
     Change,
     Strategy,
     available_changes,
+    needs_whole,
     smallest_fitting,
 )
 from persist_cli.doctor.dry_run import dry_run, network_dry_run, network_recipe
@@ -72,14 +73,11 @@ class Doctor:
         meta_model: the recipe with its backbone, or its model of scenes.
         machine: the machine to train on.
         sharded: whether the training uses FSDP2, whatever else is changed.
-        stage2: the stage 2 that stands on this stage 1, to compare with; ``None`` when there is none.
     """
 
-    def __init__(
-        self, meta_model: MetaModel | SceneMetaModel, machine: Machine, sharded: bool, stage2: MetaModel | None = None
-    ) -> None:
+    def __init__(self, meta_model: MetaModel | SceneMetaModel, machine: Machine, sharded: bool) -> None:
         self.meta_model, self.machine, self.sharded = meta_model, machine, sharded
-        self.stage2 = stage2
+        self.stage2: MetaModel | None = None
         self.estimators: dict[Lora | None, Estimator] = {meta_model.recipe.lora: meta_model.estimator()}
         self.not_considered: dict[str, str] = {}  # changes that cannot be made here, and why
         changes = available_changes(meta_model.recipe, machine, sharded)
@@ -95,6 +93,14 @@ class Doctor:
             self.not_considered[change.name] = str(error)
             return False
         return True
+
+    def compare_stage2(self, overrides: Sequence[str]) -> None:
+        """Compare with the stage 2 that stands on this stage 1, where persist has one; else say why it cannot be."""
+        assert isinstance(self.meta_model, MetaModel)
+        try:
+            self.stage2 = build_stage2_meta_model(self.meta_model, overrides)
+        except PersistError as error:
+            self.not_considered[STAGE2.name] = str(error)
 
     def examine(self, strategy: Strategy) -> Finding:
         """Estimate what the recipe needs with these changes."""
@@ -158,6 +164,8 @@ def run_doctor(name: str, overrides: Sequence[str], machine: Machine, sharded: b
         raise PersistError(f"{samples} samples at once on a device: no plan is made of more than {MOST_SAMPLES}")
     if sharded and isinstance(meta_model, SceneMetaModel):
         raise PersistError("--fsdp: a model of scenes is not sharded; leave it out")
+    if sharded and needs_whole(meta_model.recipe):
+        raise PersistError("--fsdp: distill, adversarial and data.own_writes need the whole model; leave it out")
     if sharded and isinstance(meta_model, MetaModel):
         meta_model.backbone.trained_parameters(meta_model.recipe.stage)
         check_sharded(meta_model.recipe, meta_model.backbone)
@@ -165,8 +173,8 @@ def run_doctor(name: str, overrides: Sequence[str], machine: Machine, sharded: b
         if isinstance(meta_model, SceneMetaModel):
             doctor, model = Doctor(meta_model, machine, sharded), network_dry_run(meta_model.recipe)
         else:
-            doctor = Doctor(meta_model, machine, sharded, build_stage2_meta_model(meta_model, overrides))
-            model = dry_run(meta_model)
+            doctor, model = Doctor(meta_model, machine, sharded), dry_run(meta_model)
+            doctor.compare_stage2(overrides)
     findings, best = doctor.findings(), doctor.smallest()
     if json:
         print_json(_record(machine, model, findings, best) | {"not_considered": doctor.not_considered})

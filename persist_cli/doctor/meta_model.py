@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import torch
 
@@ -25,8 +26,10 @@ from persist_cli.doctor.memory_estimate import BackboneEstimator, SceneEstimator
 from persist_cli.errors import RecipeError
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.plugins import make_scene_model
-from persist_cli.recipe import Recipe, apply_overrides, make_recipe, read_recipe, recipe_names
+from persist_cli.recipe import OF_A_BACKBONE, Recipe, apply_overrides, make_recipe, read_recipe, recipe_names
 from persist_cli.viewing.console import warn
+
+KEPT: Final = frozenset(f"training.{name}" for name in ("batch", "precision", *OF_A_BACKBONE))  # from stage 1 to 2
 
 
 @dataclass(frozen=True)
@@ -132,10 +135,15 @@ def build_stage2_meta_model(stage1: MetaModel, overrides: Sequence[str]) -> Meta
 
     Args:
         stage1: the meta model of the stage before.
-        overrides: the KEY=VALUE changes of that stage, which hold for stage 2 too.
+        overrides: the KEY=VALUE changes of that stage; the batch and those that save memory hold for stage 2 too.
+
+    Raises:
+        PersistError: when its parts do not go together.
     """
     name = re.sub("-stage1(-lora)?$", "-stage2-voxel", stage1.name)
     if name == stage1.name or name not in recipe_names():
         return None
-    values = apply_overrides(read_recipe(name), [*overrides, "lora=null", f"base={stage1.name}"])
-    return MetaModel.of(name, make_recipe(values, name), None)
+    kept = [text for text in overrides if text.partition("=")[0].strip() in KEPT]
+    values = apply_overrides(read_recipe(name), [*kept, f"base={stage1.name}"])
+    values["backbone"] = {"name": stage1.backbone.name, "settings": stage1.backbone.checkpoint_settings()}
+    return MetaModel.of(name, make_recipe(with_adapter(values), name), None)

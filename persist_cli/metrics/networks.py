@@ -54,13 +54,14 @@ def _read(file: Path, shapes: tuple[tuple[str, tuple[int, ...]], ...], device: t
 
 def check_shapes(tensors: Mapping[str, Tensor], shapes: Shapes, file: Path) -> None:
     """Raise ``CheckpointError`` naming the file and the first tensor that is missing, of another shape or unknown."""
+    again = f"delete {file.parent} and fetch the weights again"
     for name, shape in shapes.items():
         file_shape = tuple(tensors[name].shape) if name in tensors else "none"
         if file_shape != shape:
-            raise CheckpointError(f"{file}: tensor {name!r} is {file_shape}, wanted {shape}; fetch the weights again")
+            raise CheckpointError(f"{file}: tensor {name!r} is {file_shape}, wanted {shape}; {again}")
     unknown = sorted(set(tensors) - set(shapes))
     if unknown:
-        raise CheckpointError(f"{file}: unknown tensor {unknown[0]!r}; fetch the weights again")
+        raise CheckpointError(f"{file}: unknown tensor {unknown[0]!r}; {again}")
 
 
 @contextmanager

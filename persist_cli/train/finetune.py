@@ -8,7 +8,7 @@ import itertools
 import json
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
@@ -43,6 +43,7 @@ from persist_cli.checkpoints.load import (
 from persist_cli.checkpoints.placement import warn_if_slow
 from persist_cli.checkpoints.relink import weights_at
 from persist_cli.checkpoints.scene_models import check_stage, find_scene_model
+from persist_cli.data.reference import data_folder
 from persist_cli.errors import PersistError, RecipeError
 from persist_cli.io.files import check_folder
 from persist_cli.memorize.factory import MemoryFactory
@@ -152,9 +153,16 @@ def check_run(run: Path, recipe: Recipe, resume: bool) -> None:
     pointer = base_pointer(read_card(steps[-1] / "model")) if network_of(recipe) is None else None
     if "base" in changed and recipe.base and pointer and weights_at(recipe.base, pointer):
         changed.remove("base")
+    if "data.path" in changed and _places(before["data"]["path"]) == _places(recipe.data.path):
+        changed.remove("data.path")
     if changed:
         raise RecipeError(f"{run}: cannot resume with another recipe; {', '.join(changed)} changed")
     check_scene_model(recipe, run)
+
+
+def _places(paths: Iterable[str]) -> list[Path]:
+    """The folders of data, whichever way they are written."""
+    return [data_folder(path).resolve() for path in paths]
 
 
 def finetune(recipe: Recipe, run: Path, stop: StopSignal, plan: FinetunePlan) -> int | None:
@@ -334,7 +342,9 @@ def next_command(name: str, recipe: Recipe, run: Path) -> str:
         return f"persist bench plan --policy {run}"
     data = " ".join(f"--data {folder}" for folder in recipe.data.path)
     if recipe.stage == "scene-codec":
-        return f"persist finetune {name.removesuffix('-codec')} {data} base={run}"
+        following = name.removesuffix("-codec")
+        known = following if following != name and following in recipe_names() else "RECIPE"
+        return f"persist finetune {known} {data} base={run}"
     if recipe.stage == "scene-outcome":
         return f"persist bench scene {run} --data HELD_OUT_DATA --parts evolution --out runs/bench-evolution"
     if recipe.stage == "scene":

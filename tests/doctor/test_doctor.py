@@ -13,7 +13,7 @@ import torch
 
 from persist_backbones.cogvideox.inputs import _fitted_positions
 from persist_cli.api.clips import ClipLatents
-from persist_cli.doctor.changes import CHECKPOINTING, EIGHT_BIT, FROZEN, OFFLOAD, Strategy, strategies
+from persist_cli.doctor.changes import CHECKPOINTING, EIGHT_BIT, FROZEN, LORA, OFFLOAD, Strategy, strategies
 from persist_cli.doctor.doctor import Doctor, _verdict, launch_command
 from persist_cli.doctor.machine import GIB, Machine
 from persist_cli.doctor.memory_estimate import Launch
@@ -210,6 +210,46 @@ def test_stage_1_is_compared_with_the_stage_2_that_stands_on_it(persist):
     assert (stage1[-1]["name"], stage1[-1]["recipe"]) == ("stage 2 only", "tiny-stage2-voxel")
     assert stage1[-1]["need"] == stage2[0]["need"]
     assert not any(strategy["name"] == "stage 2 only" for strategy in stage2)
+
+
+def test_stage_2_is_compared_on_the_model_of_this_stage_1_whatever_else_this_is_given(persist):
+    def stage2(*settings):
+        words = ("houses-64-stage1", "backbone.settings.image_noise=0.2", *settings, "--gpus", "1", "--json")
+        ended = persist("doctor", *words, "--gpu-memory", "8")
+        assert ended.code == 0, ended.err
+        return json.loads(ended.out)["strategies"][-1]
+
+    plain = stage2()
+    assert (plain["name"], plain["recipe"]) == ("stage 2 only", "houses-64-stage2-voxel")
+    assert stage2("training.accumulation=32", "training.cooldown=2000")["need"] == plain["need"]
+    wider = stage2("backbone.settings.transformer.num_layers=12")
+    assert wider["need"]["weights"] > plain["need"]["weights"]
+
+
+def test_a_stage_2_that_cannot_stand_on_this_stage_1_is_said(persist):
+    ended = persist("doctor", "capture-64-stage1", "backbone.settings.transformer.num_layers=2", "--gpu-memory", "8",
+                    "--gpus", "1")  # fmt: skip
+    assert (ended.code, "not considered: stage 2 only (" in ended.out) == (0, True), ended.err
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [["data.own_writes=0.5"], ["distill.steps=1", "training.ema=0.9"], ["adversarial.steps=4"]],
+    ids=["own writes", "distillation", "discriminator"],
+)
+def test_no_sharding_is_proposed_where_each_process_needs_the_whole_model(persist, settings):
+    doctor = Doctor(
+        micro_meta_model(*settings, "training.optimizer=adamw", "base=nowhere"), Machine("cuda", 2, 1), False
+    )
+    assert not [strategy for strategy in strategies(doctor.changes) if doctor.launch(strategy).sharded]
+    ended = persist("doctor", "tiny-stage1", *settings, "base=nowhere", "--gpus", "2", "--gpu-memory", "8", "--fsdp")
+    assert (ended.code, "need the whole model; leave it out" in ended.err) == (1, True), ended.err
+
+
+def test_lora_is_not_proposed_to_an_optimizer_that_cannot_train_it():
+    for optimizer, proposed in (("adamw", True), ("muon", False)):
+        doctor = Doctor(micro_meta_model(f"training.optimizer={optimizer}"), Machine("cuda", 1, 1), False)
+        assert (LORA in doctor.changes) is proposed
 
 
 def test_the_launch_command_has_the_users_options_and_the_pretrained_weights_to_begin_with(persist, tmp_path):

@@ -411,6 +411,23 @@ def test_the_next_stage_is_of_the_same_recipes(recipe, following):
     assert command == f"persist finetune {following} --data d base=run"
 
 
+@pytest.mark.parametrize(("name", "following"), [("tiny-scene-codec", "tiny-scene"), ("my-codec.yaml", "RECIPE")])
+def test_after_the_codec_of_scenes_comes_the_model_of_the_same_recipes(name, following):
+    recipe = make_recipe(read_recipe("tiny-scene-codec") | {"data": {"path": "d"}}, name)
+    assert next_command(name, recipe, Path("run")) == f"persist finetune {following} --data d base=run"
+
+
+def test_a_run_goes_on_with_its_data_written_another_way(persist, walks, codec, tmp_path, monkeypatch):
+    run = stage("stage1", walks, tmp_path / "run", f"base={codec}", "training.steps=1")
+    assert persist(*run).code == 0
+    monkeypatch.chdir(walks.parent)
+    again = [walks.name if word == str(walks) else word for word in run]
+    assert again != run
+    assert persist(*again, "training.steps=2", "--resume").code == 0
+    elsewhere = [str(codec) if word == str(walks) else word for word in run]
+    assert "data.path changed" in persist(*elsewhere, "training.steps=3", "--resume").err
+
+
 def test_a_scene_model_is_measured_next_with_a_data_set_of_its_training(tmp_path):
     recipe = make_recipe(read_recipe("tiny-scene") | {"data": {"path": ["one", "two"]}}, "tiny-scene")
     command = next_command("tiny-scene", recipe, tmp_path)
@@ -442,3 +459,16 @@ def test_a_recipe_with_settings_of_its_own_for_an_adapter_that_is_trained_on_is_
     result = persist(*stage("stage2-voxel", walks, "out", f"base={voxel}", f"adapter_from={voxel}"))
     assert result.code == 1
     assert "memory and settings come with that adapter; leave out" in result.err
+
+
+@pytest.mark.parametrize(
+    ("memory", "cause"),
+    [
+        ("voxel", "memory must be a mapping, or null, not 'voxel'"),
+        ("{settings: [1]}", "memory.settings must be a mapp"),
+    ],
+)
+def test_a_memory_that_is_no_mapping_is_refused_with_an_adapter_too(persist, walks, voxel, stage1, memory, cause):
+    changes = (f"base={stage1}", f"adapter_from={voxel}", "adapter={}", f"memory={memory}")
+    result = persist(*stage("stage2-voxel", walks, "out", *changes))
+    assert (result.code, cause in result.err) == (1, True), result.err

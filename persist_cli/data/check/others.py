@@ -6,7 +6,7 @@ import contextlib
 import json
 from pathlib import Path
 
-from persist_cli.api.checkpoint import CARD, POLICY_CARD, SCENE_CARD, STEP, find_checkpoint
+from persist_cli.api.checkpoint import CARD, POLICY_CARD, SCENE_CARD, STEP, checkpoint_folder, find_checkpoint
 from persist_cli.io.files import read_json
 
 RESULTS = {  # files that name what a folder is
@@ -30,7 +30,8 @@ def describe_other(path: Path) -> str | None:
         cards = [card for pattern in patterns for card in sorted(path.glob(pattern), reverse=True)]
         if cards:
             return describe(path, cards[0])
-    if (path / CARD).is_file() or any(path.glob(f"{STEP}*/model")):
+    patterns = (CARD, f"model/{CARD}", f"{STEP}*/model")  # of a folder, a checkpoint, a run
+    if any(any(checkpoint_folder(path).glob(pattern)) for pattern in patterns):
         return _describe_checkpoint(path)
     return next((text.format(path=path) for name, text in RESULTS.items() if (path / name).is_file()), None)
 
@@ -64,7 +65,7 @@ def _describe_memory(path: Path) -> str | None:
 
 def _describe_checkpoint(path: Path) -> str:
     checkpoint = find_checkpoint(path)
-    is_run = not (path / CARD).is_file()
+    is_run = any(path.glob(f"{STEP}*/model"))
     kind = f"a finetune run, its newest checkpoint {checkpoint.folder.parent.name}" if is_run else "a checkpoint folder"
     adapters = ", ".join(checkpoint.adapters)
     return (

@@ -220,6 +220,11 @@ def test_what_is_no_data_set_is_named_with_the_command_that_looks_at_it(
             "is a checkpoint folder: backbone cogvideox, adapters voxel",
             "persist eval",
         ),
+        (
+            next(voxel.glob("step-*")),
+            "is a checkpoint folder: backbone cogvideox, adapters voxel",
+            "persist eval",
+        ),
         (tmp_path / "rollout", "is a rollout", "sheet.png"),
     ):
         result = persist("inspect", path)
