@@ -8,7 +8,7 @@ import itertools
 import json
 import re
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
@@ -43,7 +43,6 @@ from persist_cli.checkpoints.load import (
 from persist_cli.checkpoints.placement import warn_if_slow
 from persist_cli.checkpoints.relink import weights_at
 from persist_cli.checkpoints.scene_models import check_stage, find_scene_model
-from persist_cli.data.reference import data_folder
 from persist_cli.errors import PersistError, RecipeError
 from persist_cli.io.files import check_folder
 from persist_cli.memorize.factory import MemoryFactory
@@ -70,7 +69,14 @@ from persist_cli.train.distributed import (
 from persist_cli.train.policy_trainer import PolicyTrainer
 from persist_cli.train.run_folder import AnyTrainer, RunFolder
 from persist_cli.train.scene_trainer import SceneTrainer
-from persist_cli.train.sources import check_scene_model, distilled, held_sources, known_hashes, knows_scene_model
+from persist_cli.train.sources import (
+    check_scene_model,
+    distilled,
+    has_same_data,
+    held_sources,
+    known_hashes,
+    knows_scene_model,
+)
 from persist_cli.train.state import load_state
 from persist_cli.train.tensor_cache import CacheSettings
 from persist_cli.train.trainer import Trainer
@@ -134,7 +140,7 @@ def check_run(run: Path, recipe: Recipe, resume: bool) -> None:
     """Raise ``PersistError`` when no run can be written there, or when this is not the run in the folder to go on with.
 
     Settings that ``changeable_on_resume`` names may be others than those of the run in the folder, and the base, what
-    is distilled and the model that imagines may be at another place.
+    is distilled, the model that imagines and the data may be at another place.
     """
     check_folder(run)
     steps = step_folders(run)
@@ -153,16 +159,11 @@ def check_run(run: Path, recipe: Recipe, resume: bool) -> None:
     pointer = base_pointer(read_card(steps[-1] / "model")) if network_of(recipe) is None else None
     if "base" in changed and recipe.base and pointer and weights_at(recipe.base, pointer):
         changed.remove("base")
-    if "data.path" in changed and _places(before["data"]["path"]) == _places(recipe.data.path):
+    if "data.path" in changed and has_same_data(recipe, run):
         changed.remove("data.path")
     if changed:
         raise RecipeError(f"{run}: cannot resume with another recipe; {', '.join(changed)} changed")
     check_scene_model(recipe, run)
-
-
-def _places(paths: Iterable[str]) -> list[Path]:
-    """The folders of data, whichever way they are written."""
-    return [data_folder(path).resolve() for path in paths]
 
 
 def finetune(recipe: Recipe, run: Path, stop: StopSignal, plan: FinetunePlan) -> int | None:

@@ -2,7 +2,8 @@
 
 A run's base is known by the cards of its checkpoints. What a distillation reads besides, its teacher and the adapter
 that is distilled, is known by the hashes of their weights in a file of the run's folder: a teacher's run may train on.
-So may that of a model that imagines in the run's scenes; another one than the run began with is refused.
+So may that of a model that imagines in the run's scenes; another one than the run began with is refused. Data sets are
+known by the names and sizes of their files, wherever they are.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from accelerate import PartialState
 from accelerate.utils import broadcast_object_list
@@ -31,6 +32,8 @@ from persist_cli.checkpoints.load import named_adapter
 from persist_cli.checkpoints.relink import run_base
 from persist_cli.checkpoints.retention import mark_in_use, unmark_in_use
 from persist_cli.checkpoints.save import fingerprint
+from persist_cli.data.reference import data_folder
+from persist_cli.data.store import Store
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import read_json, write_json
 from persist_cli.io.sha256sums import hash_files
@@ -40,6 +43,8 @@ from persist_cli.recipe import Recipe, network_of
 DISTILLED: Final = "distilled.json"  # in a run's folder: hashes of what it distils, by the recipe's keys
 
 IMAGINED: Final = "imagined.json"  # in a run's folder: the hash of the model that imagines in its scenes
+
+DATA: Final = "data.json"  # in a run's folder: names and bytes of the trajectories, data set by data set
 
 
 def distilled(recipe: Recipe) -> dict[str, str]:
@@ -57,7 +62,7 @@ def known_hashes(run: Path) -> dict[str, str]:
 
 
 def write_hashes(recipe: Recipe, run: Path) -> None:
-    """Write the hashes of what a run distils, and of the model that imagines in its scenes, into its folder.
+    """Write into a run's folder by what its data are known, what it distils, and the model that imagines in its scenes.
 
     Args:
         recipe: the recipe that ``held_sources`` returned.
@@ -69,6 +74,18 @@ def write_hashes(recipe: Recipe, run: Path) -> None:
     imagined = "" if recipe.memory is None else scene_model_fingerprint(recipe.memory)
     if imagined:
         write_json(run / IMAGINED, {"fingerprint": imagined})
+    write_json(run / DATA, data_files(recipe))
+
+
+def data_files(recipe: Recipe) -> list[list[list[Any]]]:
+    """Name and bytes of each trajectory of a recipe's data sets, as JSON values."""
+    folders = [data_folder(path) for path in recipe.data.path]
+    return [[[file.path.name, file.path.stat().st_size] for file in Store(folder)] for folder in folders]
+
+
+def has_same_data(recipe: Recipe, run: Path) -> bool:
+    """Whether a recipe's data are those of a run, which may have been moved since; unknown ones are not."""
+    return (run / DATA).is_file() and read_json(run / DATA) == data_files(recipe)
 
 
 def check_scene_model(recipe: Recipe, run: Path) -> None:

@@ -38,7 +38,7 @@ from tests.support.processes import ForkedProcess, run_in_a_session, start_persi
 
 
 def test_a_run_writes_its_recipe_logs_loss_curve_and_checkpoint(codec):
-    names = {"recipe.yaml", "log.jsonl", "loss.png", "speed.jsonl", "step-00000004"}
+    names = {"recipe.yaml", "log.jsonl", "loss.png", "speed.jsonl", "data.json", "step-00000004"}
     assert {path.name for path in codec.iterdir()} - {"used-by"} == names
     assert json.loads((codec / "speed.jsonl").read_text())["samples_per_second"] > 0
     rows = [json.loads(line) for line in (codec / "log.jsonl").read_text().splitlines()]
@@ -417,15 +417,20 @@ def test_after_the_codec_of_scenes_comes_the_model_of_the_same_recipes(name, fol
     assert next_command(name, recipe, Path("run")) == f"persist finetune {following} --data d base=run"
 
 
-def test_a_run_goes_on_with_its_data_written_another_way(persist, walks, codec, tmp_path, monkeypatch):
-    run = stage("stage1", walks, tmp_path / "run", f"base={codec}", "training.steps=1")
+def test_a_run_goes_on_with_its_data_at_another_place_and_with_no_others(persist, walks, codec, tmp_path):
+    data, moved = tmp_path / "data", tmp_path / "moved"
+    shutil.copytree(walks, data)
+    run = stage("stage1", data, tmp_path / "run", f"base={codec}", "training.steps=1")
     assert persist(*run).code == 0
-    monkeypatch.chdir(walks.parent)
-    again = [walks.name if word == str(walks) else word for word in run]
-    assert again != run
+    data.rename(moved)
+    again = [str(moved) if word == str(data) else word for word in run]
     assert persist(*again, "training.steps=2", "--resume").code == 0
-    elsewhere = [str(codec) if word == str(walks) else word for word in run]
-    assert "data.path changed" in persist(*elsewhere, "training.steps=3", "--resume").err
+    assert not (tmp_path / "run/data.json").read_text().count(str(tmp_path))
+    sorted(moved.glob("*.parquet"))[0].unlink()
+    ended = persist(*[str(walks) if word == str(data) else word for word in run], "training.steps=3", "--resume")
+    assert ended.code == 0  # whole again
+    moved.rename(data)
+    assert "data.path changed" in persist(*run, "training.steps=4", "--resume").err
 
 
 def test_a_scene_model_is_measured_next_with_a_data_set_of_its_training(tmp_path):
