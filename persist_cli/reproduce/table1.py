@@ -3,7 +3,7 @@
 ``python -m persist_cli.reproduce.table1 [OUT]`` runs them in order, each in a process of its own; with ``--reference``
 it trains nothing and measures the model that comes with the package, as its card says. Every command continues where it
 was stopped and repeats nothing that is done, so this may be stopped and started at any time. With ``--trial`` each
-command runs in its smallest form, to see within an hour that all of them work here; its figures are worth nothing.
+command runs in its smallest form, to see in about an hour that all of them work here; its figures are worth nothing.
 
 Houses for training, validation and test share no scene. Cells, head and sampling are chosen for each memory by itself
 on validation houses, by ``persist_cli.reproduce.choose``, before any of the tables is measured.
