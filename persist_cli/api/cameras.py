@@ -134,6 +134,9 @@ def check_poses(poses: Float[Tensor, "frame 4 4"], where: str) -> None:
 def check_intrinsics(intrinsics: Float[Tensor, "3 3"], where: str) -> None:
     """Raise ``DataError``, which begins with ``where``, when the matrix is no invertible pinhole matrix."""
     finite = bool(torch.isfinite(intrinsics).all())
-    if not finite or intrinsics[0, 0] <= 0 or intrinsics[1, 1] <= 0 or abs(float(intrinsics[2, 2]) - 1) > 1e-6:
+    below = intrinsics.tril(-1).abs().amax() > 1e-6
+    corner = abs(float(intrinsics[2, 2]) - 1) > 1e-6
+    if not finite or intrinsics[0, 0] <= 0 or intrinsics[1, 1] <= 0 or corner or below:
         values = [round(float(value), 3) for value in intrinsics.flatten()]
-        raise DataError(f"{where}: the intrinsics {values} are singular or not a pinhole matrix")
+        turned = "; they look transposed" if finite and below and not intrinsics.triu(1).any() else ""
+        raise DataError(f"{where}: the intrinsics {values} are singular or not a pinhole matrix{turned}")

@@ -158,7 +158,7 @@ def find_checkpoint(path: Path) -> Checkpoint:
     inherits = not card.get("sampling") and not card.get("protocol_sampling")
     return Checkpoint(
         folder=folder,
-        name=run_folder(folder).name,
+        name=run_folder(folder.absolute()).name,
         base_folder=base,
         backbone=base_card["backbone"],
         settings=base_card["settings"],

@@ -111,7 +111,7 @@ class SamplingOverrides:
         Raises:
             PersistError: for an unknown protocol or setting, and for a value that is no number where one is wanted.
         """
-        named = dict(cls._named(text, "--sampling-for") for text in texts)
+        named = cls._by_name(texts, "--sampling-for")
         for protocol in named:
             if protocol not in PROTOCOLS:
                 raise PersistError(f"--sampling-for: unknown protocol {protocol!r}; {hint(protocol, PROTOCOLS)}")
@@ -124,7 +124,17 @@ class SamplingOverrides:
         Raises:
             PersistError: for an unknown setting, and for a value that is no number where one is wanted.
         """
-        return dict(cls._named(text, "--sampling-of") for text in texts)
+        return cls._by_name(texts, "--sampling-of")
+
+    @classmethod
+    def _by_name(cls, texts: Iterable[str], option: str) -> dict[str, Self]:
+        """Return what texts mean by the name before the colon, which may stand in one of them alone."""
+        named: dict[str, Self] = {}
+        for name, settings in (cls._named(text, option) for text in texts):
+            if name in named:
+                raise PersistError(f"{option}: {name} is named twice; put its settings into one, with commas")
+            named[name] = settings
+        return named
 
     @classmethod
     def _named(cls, text: str, option: str) -> tuple[str, Self]:

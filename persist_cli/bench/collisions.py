@@ -32,7 +32,7 @@ from persist_cli.checkpoints.placement import check_placement
 from persist_cli.data.held_out import was_trained_on
 from persist_cli.errors import DataError
 from persist_cli.evaluate.statistics import Draws, Figure, make_figure
-from persist_cli.io.files import check_folder, write_json
+from persist_cli.io.files import check_file, write_json
 from persist_cli.memorize.factory import MemoryFactory, as_scene
 from persist_cli.memorize.memory_config import scene_config
 from persist_cli.navigation.ground_mapper import GroundMapper, body_of
@@ -128,7 +128,7 @@ def run_collisions(path: Path | None, plan: CollisionPlan, out: Path, as_json: b
     checkpoint = find_checkpoint(path or reference_checkpoint())
     adapters = chosen_adapters(plan, checkpoint)
     sampling = checkpoint.sampling_with(plan.sampling)
-    check_folder(out.parent)
+    check_file(out)
     with busy("loading the model"):
         backbone = load_backbone(checkpoint)
     backbone.check_sampling(sampling)

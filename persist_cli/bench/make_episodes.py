@@ -8,7 +8,7 @@ from pathlib import Path
 from persist_cli.bench.episodes import Episode, EpisodeSet
 from persist_cli.bench.find_episodes import EpisodeSearch, find_episodes
 from persist_cli.errors import DataError
-from persist_cli.io.files import check_folder
+from persist_cli.io.files import check_file
 from persist_cli.plugins import check_simulator, make_simulator
 from persist_cli.simulators.collect import CollectPlan
 from persist_cli.viewing.console import add_task, print_json, print_table, progress, say
@@ -49,7 +49,7 @@ def run_episodes(scenes: CollectPlan, search: EpisodeSearch, out: Path, json: bo
     Raises:
         PersistError: as ``draw_episodes`` does, and when ``out`` cannot be written.
     """
-    check_folder(out.parent)
+    check_file(out)
     episodes = draw_episodes(scenes, search)
     out.parent.mkdir(parents=True, exist_ok=True)
     episodes.write(out)

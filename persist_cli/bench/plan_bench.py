@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -19,7 +20,7 @@ from persist_cli.bench.episodes import Episode, EpisodeSet, read_episodes
 from persist_cli.bench.find_episodes import EpisodeSearch
 from persist_cli.bench.make_episodes import draw_episodes
 from persist_cli.bench.navigator import Navigator, PlanSettings, RowParts
-from persist_cli.bench.planning_journal import PlanningJournal
+from persist_cli.bench.planning_journal import PlanningJournal, check_row_folders
 from persist_cli.bench.rows import ALONE, NO_MEMORY, PlanningRow, RowChoice, default_rows
 from persist_cli.bench.run_episode import LoopSettings, run_closed_loop, run_open_loop
 from persist_cli.bench.stop_rules import StopAtPlace, StopByCost, StopRule, StopThresholds, stop_thresholds
@@ -42,6 +43,9 @@ from persist_cli.viewing.console import add_task, busy, progress, warn
 LOOPS: Final = ("closed", "open")
 
 
+SCENES: Final = "0:24"  # test houses in which episodes are drawn
+
+
 @dataclass(frozen=True)
 class EpisodeSource:
     """Where episodes come from: a file, or scenes that they are drawn in.
@@ -59,19 +63,23 @@ class EpisodeSource:
     bins: tuple[int, ...] | None = None
 
     @staticmethod
-    def of(file: Path | None, scenes: str, bins: Sequence[int] | None, each: int) -> EpisodeSource:
+    def of(file: Path | None, scenes: str | None, bins: Sequence[int] | None, each: int | None) -> EpisodeSource:
         """Return where episodes come from, by the options of a command; scenes are test houses of ``miniworld``.
 
         Args:
             file: of episodes; ``None`` to draw them.
-            scenes: ``A:B``, B not included.
+            scenes: ``A:B``, B not included; ``None`` for the usual ones.
             bins: actions of the shortest ways; ``None`` for the file's, or the usual ones.
-            each: most drawn episodes of each kind.
+            each: most drawn episodes of each kind; ``None`` for the usual number.
+
+        Raises:
+            PersistError: when it is said what to draw beside a file, which has its episodes.
         """
-        search = EpisodeSearch(each=each) if bins is None else EpisodeSearch(tuple(bins), each)
-        return EpisodeSource(
-            file, CollectPlan("miniworld", scenes, split="test"), search, None if bins is None else tuple(bins)
-        )
+        if file is not None and (scenes is not None or each is not None):
+            raise PersistError("--scenes and --each: of episodes that are drawn, not with --episodes, which has them")
+        search = EpisodeSearch(bins or EpisodeSearch.bins, EpisodeSearch.each if each is None else each)
+        houses = CollectPlan("miniworld", scenes or SCENES, split="test")
+        return EpisodeSource(file, houses, search, tuple(bins) if bins else None)
 
     def identity(self, unset: bool = False) -> dict[str, Any]:
         """Return JSON values that are equal for equal episodes.
@@ -191,6 +199,7 @@ def prepare(plan: BenchPlan, out: Path, processes: Processes) -> PlanningBench:
     policies = open_policies(plan, rows)
     check_policies(rows, policies, plan.planning.horizon)
     check_options(plan, rows, cost)
+    check_row_folders(rows)
     checkpoint = find_checkpoint(plan.checkpoint) if any(row.uses_world_model for row in rows) else None
     journal = PlanningJournal(out)
     if processes.main:
@@ -226,10 +235,12 @@ def open_policies(plan: BenchPlan, rows: Sequence[PlanningRow]) -> dict[str | No
 
 
 def check_options(plan: BenchPlan, rows: Sequence[PlanningRow], cost: Cost) -> None:
-    """Raise ``PersistError`` when an option has no effect on any row."""
+    """Raise ``PersistError`` when an option has no effect on any row, or is no number that has one."""
     if plan.planning.cem_options and not any(row.searches for row in rows):
         options = ", ".join(plan.planning.cem_options)
         raise PersistError(f"{options}: no row has the cross-entropy method; add cem to --rows, or leave it out")
+    if plan.stop_cost is not None and not math.isfinite(plan.stop_cost):
+        raise PersistError(f"--stop-cost {plan.stop_cost:g}: give a finite number; at a negative one no agent stops")
     if plan.stop_cost is not None and not stops_by_cost(cost, rows):
         raise PersistError(f"--stop-cost {plan.stop_cost:g}: agents that are told the place of their goal stop there")
     sampled = plan.sampling != SamplingOverrides() or plan.placement != InferenceOptions()

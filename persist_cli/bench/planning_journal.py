@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -102,7 +103,20 @@ class PlanningJournal:
         return dict(read_json(self._file(row, episode)))
 
     def _file(self, row: PlanningRow, episode: Episode) -> Path:
-        return self.parts / re.sub(r"[^a-z0-9]+", "-", row.name.lower()) / f"{episode.name}.json"
+        return self.parts / row_folder(row) / f"{episode.name}.json"
+
+
+def row_folder(row: PlanningRow) -> str:
+    """The name of the folder in which a row's episodes are kept."""
+    return re.sub(r"[^a-z0-9]+", "-", row.name.lower())
+
+
+def check_row_folders(rows: Sequence[PlanningRow]) -> None:
+    """Raise ``DataError`` when two rows would be kept in one folder, so that one would have the other's figures."""
+    named: dict[str, str] = {}
+    for row in rows:
+        if (other := named.setdefault(row_folder(row), row.name)) != row.name:
+            raise DataError(f"the rows {other!r} and {row.name!r} would be kept in one folder; rename an adapter")
 
 
 def completed(identity: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:

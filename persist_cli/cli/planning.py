@@ -38,10 +38,13 @@ bench_app = typer.Typer(no_args_is_help=True, help="Measure plans, collisions an
 planning_app.add_typer(bench_app, name="bench")
 
 
+RENDERING = ("checkpoint", "denoising_steps", "sampler", "guidance", "dtype", "save_memory")  # of what draws scenes
+
 OF_PARTS = {  # parts of `bench scene` that have a use for options
     "seeds": ("completion", "walk", "return", "evolution"),
     "walk_steps": ("walk",), "walks": ("walk", "return"), "return_steps": ("return",), "memories": ("return",),
-    "edits": ("edits",), "interactions": ("evolution",),
+    "edits": ("edits",), "interactions": ("evolution",), "train": ("completion",), "houses": ("completion",),
+    **dict.fromkeys(RENDERING, ("return", "edits")),
 }  # fmt: skip
 
 
@@ -50,6 +53,8 @@ def refuse_other_parts(context: typer.Context, chosen: Sequence[str]) -> None:
     for name, parts in OF_PARTS.items():
         if not set(parts) & set(chosen):
             refuse_options(context, name, f"only with --parts {' or '.join(parts)}")
+    if context.params["train"] is None:
+        refuse_options(context, "houses", "only with --train, whose houses are read")
 
 
 def whole_numbers(option: str, text: str) -> tuple[int, ...]:
@@ -239,9 +244,9 @@ def bench_collisions(
 def bench_plan(
     checkpoint: Annotated[Path, typer.Argument(help="Run or checkpoint of the world model.")] = Path("reference"),
     episodes: Annotated[Path | None, typer.Option(help="File of episodes; else they are drawn.")] = None,
-    scenes: Annotated[str, typer.Option(help="Test houses A:B of miniworld to draw episodes in.")] = "0:24",
+    scenes: Annotated[str | None, typer.Option(help="Test houses A:B of miniworld to draw episodes in; 0:24.")] = None,
     bins: Annotated[str | None, typer.Option(help="Actions of the shortest ways; 8,16,32,64, or the file's.")] = None,
-    each: Annotated[int, typer.Option(min=1, help="Most drawn episodes of each bin, in sight and hidden.")] = 16,
+    each: Annotated[int | None, typer.Option(min=1, help="Most drawn of each bin, in sight and hidden; 16.")] = None,
     rows: Annotated[str | None, typer.Option(help="Rows, as in random,shortest-path,policy,rank-8,cem.")] = None,
     memories: Annotated[str, typer.Option(help="Memories; simulator: the true scene is the model.")] = PLAN_MEMORIES,
     policy: Annotated[str | None, typer.Option(help="A policy, or a trained one's folder; else random.")] = None,

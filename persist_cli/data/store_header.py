@@ -47,9 +47,9 @@ def schema(info: TrajectoryInfo, cells: CellGrid | None = None) -> pa.Schema:
         "version": VERSION,
         "scene": info.scene,
         "intrinsics": np.asarray(info.intrinsics, dtype=np.float64).tolist(),
-        "height": info.height,
-        "width": info.width,
-        "world_up": list(info.world_up),
+        "height": int(info.height),
+        "width": int(info.width),
+        "world_up": [float(value) for value in info.world_up],
         "vocabulary": info.vocabulary.to_json(),
         "source": info.source,
     }
@@ -97,6 +97,10 @@ def check_info(info: TrajectoryInfo, where: str) -> None:
     up = np.asarray(info.world_up, dtype=np.float64)
     if up.shape != (3,) or not abs(float(np.linalg.norm(up)) - 1) < 1e-3:
         raise DataError(f"{where}: world_up {list(info.world_up)} is not a unit vector of three numbers")
+    try:
+        json.dumps(info.source)
+    except TypeError as error:
+        raise DataError(f"{where}: its source must hold values of JSON ({error})") from error
 
 
 def _header_checksum(header: dict[str, Any]) -> str:

@@ -34,6 +34,13 @@ def check_folder(path: Path) -> None:
         raise PersistError(f"{path}: cannot be written, {nearest} is read-only for this user; choose another --out")
 
 
+def check_file(path: Path) -> None:
+    """Raise ``PersistError`` when this file cannot be written, before any work is done."""
+    check_folder(path.parent)
+    if path.is_dir():
+        raise PersistError(f"{path}: a folder; name a file to write")
+
+
 SAFETENSORS_TYPES: Final = {  # the format's names for those of torch
     "float64": "F64", "float32": "F32", "float16": "F16", "bfloat16": "BF16", "float8_e4m3fn": "F8_E4M3",
     "float8_e5m2": "F8_E5M2", "int64": "I64", "int32": "I32", "int16": "I16", "int8": "I8", "uint64": "U64",

@@ -56,6 +56,7 @@ CURVE: Final = "success.png"
 FIGURES: Final = ("success", "reached", "spl", "soft_spl", "collisions_per_action", "end_metres")
 DETOUR: Final = 2.0  # times the direct way; what a walk came to by a longer one is no goal in hindsight
 MODEL, SIMULATOR = "model", "simulator"  # where a policy may practise
+LOOK: Final = ("light", "gains", "depth_sensor")  # of a collecting camera, which the true house has not
 
 
 @dataclass(frozen=True)
@@ -170,6 +171,8 @@ def prepare(plan: LearnPlan, out: Path) -> Learning:
     check_placement(plan.placement)  # a missing accelerator is an error before anything is loaded
     if plan.inside not in (MODEL, SIMULATOR):
         raise PersistError(f"--inside {plan.inside!r}: a policy practises inside the {MODEL} or the {SIMULATOR}")
+    if not 0 <= plan.stop_cost < math.inf:
+        raise PersistError(f"--stop-cost {plan.stop_cost:g}: give a finite number of at least 0")
     if plan.inside == SIMULATOR and plan.body is False:
         raise PersistError(
             f"--no-body: nobody goes through the walls of the true house; leave out --inside {SIMULATOR}"
@@ -287,7 +290,9 @@ def check_agent(file: Path, episodes: EpisodeSet, simulator: Simulator) -> None:
     other = [name for name in drawn if drawn[name] != ours[name]]
     if other:
         theirs, own = (" and ".join(f"{name} {values[name]}" for name in other) for values in (drawn, ours))
-        raise DataError(f"{file}: episodes with {theirs}, the views were collected with {own}; make both with the same")
+        raise DataError(
+            f"{file}: episodes with {theirs}, the views were collected with {own}; `bench episodes` has --size alone"
+        )
 
 
 def open_simulator(plan: LearnPlan, info: TrajectoryInfo) -> Simulator:
@@ -295,6 +300,12 @@ def open_simulator(plan: LearnPlan, info: TrajectoryInfo) -> Simulator:
     simulator = open_again(info)
     if simulator is None:
         raise DataError(f"{' '.join(plan.views)}: of no simulator; leave --episodes and --inside {SIMULATOR} out")
+    look = [name for name in LOOK if name in info.source.get("camera", {})]
+    if look:
+        raise DataError(
+            f"{' '.join(plan.views)}: collected with {' and '.join(look)} of their own, which the true house has "
+            f"not; leave --episodes and --inside {SIMULATOR} out"
+        )
     return simulator
 
 

@@ -42,8 +42,8 @@ class Budget:
     def __post_init__(self) -> None:
         if self.frames is not None and self.frames < 1:
             raise PersistError(f"a budget of {self.frames} frames imagines nothing; give --frames at least one horizon")
-        if self.seconds is not None and not self.seconds > 0:
-            raise PersistError(f"a budget of {self.seconds:g} seconds imagines nothing; give --seconds above 0")
+        if self.seconds is not None and not 0 < self.seconds < math.inf:
+            raise PersistError(f"a budget of {self.seconds:g} seconds; give --seconds above 0, or none for no bound")
 
 
 @dataclass(frozen=True)

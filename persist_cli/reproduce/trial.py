@@ -24,10 +24,11 @@ CLIPS: Final = 2  # of each evaluation
 APPENDED: Final = {  # of an option that is given twice, the last counts
     "finetune": f"training.steps={STEPS} training.batch=2 training.warmup=0 training.cooldown=0",
     "eval": f"--clips {CLIPS} --seeds 1 --steps 1",
-    "bench scene": f"--images {HOUSES} --houses {HOUSES}",
+    "bench scene": f"--images {HOUSES}",
 }
 
 OF_PARTS: Final = {  # of `bench scene`, which refuses them where it measures another part
+    "completion": f"--houses {HOUSES}",
     "walk": "--walks 1 --walk-steps 8",
     "return": "--walks 1 --return-steps 8",
     "edits": "--edits 2",

@@ -178,9 +178,12 @@ class EditSession:
     def insert(self, kind: str, color: Colour | None = None, overwrite: bool = False) -> EditOutcome:
         """Put a thing of a class on what stands in the middle of the selection; errors as of ``apply``."""
         edits: list[Edit] = []
-        up = int(np.abs(self.original.reference.world_up).argmax())
+        world_up = np.array(self.original.reference.world_up)
+        up = int(np.abs(world_up).argmax())
         for box in self._selected():
-            x, y, z = (None if axis == up else round(value, DECIMALS) for axis, value in enumerate(middle_of(box)))
+            middle = np.array(middle_of(box))
+            middle -= world_up * middle[up] / world_up[up]  # along up to where the height that is left open is 0
+            x, y, z = (None if axis == up else round(float(value), DECIMALS) for axis, value in enumerate(middle))
             edits.append(Insert(kind=kind, at=(x, y, z), color=color, overwrite=overwrite))
         return self.apply(edits)
 

@@ -152,3 +152,8 @@ def test_as_many_tokens_are_counted_as_the_adapter_attends_to() -> None:
 def test_points_are_refused_in_one_line() -> None:
     with pytest.raises(CheckpointError, match="'frames' reads whole frames, but this memory's tokens are points"):
         predicted(trained(), random_clips(), random_tokens(2, 9))
+
+
+def test_frames_that_cannot_be_cut_into_whole_patches_are_refused() -> None:
+    with pytest.raises(CheckpointError, match="frame_patch is 3; it must divide"):
+        micro().add_adapter("context", 8, {"form": "frames", "frame_patch": 3})

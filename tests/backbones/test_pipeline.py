@@ -20,7 +20,7 @@ from PIL import Image
 import persist_backbones
 from persist_backbones.cogvideox.cogvideox import CogVideoX
 from persist_backbones.extensions.inference import enable_tiling
-from persist_backbones.pipeline.call_inputs import batch_of_images
+from persist_backbones.pipeline.call_inputs import batch_of_depth, batch_of_images
 from persist_backbones.pipeline.pipeline import WorldPipeline, WorldPipelineOutput
 from persist_cli.api.backbone import Sampling
 from persist_cli.api.checkpoint import find_checkpoint
@@ -34,6 +34,9 @@ CLIPS = random_clips(2, random_tokens(2, 5))
 FORMS = pytest.mark.parametrize("form", ["cross", "projected", "canvas", "rendered"])
 FRAMEWISE = {"vae": {"block_out_channels": [8, 8, 8], "norm_num_groups": 4, "latent_channels": 4,
                      "temporal_compression_ratio": 1}}  # fmt: skip
+
+
+PLAIN = {"memory_tokens": None, "guidance_scale": 1.0}  # for a model without an adapter
 
 
 def call(pipeline: WorldPipeline, **changes: object) -> WorldPipelineOutput:
@@ -76,7 +79,7 @@ def test_a_pipeline_without_an_adapter_is_stage_1_and_saves_without_one(tmp_path
     loaded = WorldPipeline.from_pretrained(tmp_path)
     assert loaded.adapter is None
     rgb, _ = backbone.generate(CLIPS, Sampling(3))
-    assert torch.equal((call(loaded).frames.movedim(2, -1) * 255).round().to(torch.uint8), rgb)
+    assert torch.equal((call(loaded, **PLAIN).frames.movedim(2, -1) * 255).round().to(torch.uint8), rgb)
 
 
 @FORMS
@@ -211,11 +214,32 @@ def test_a_pipeline_takes_and_returns_pictures_and_arrays_and_takes_noise():
         ({"generator": [torch.Generator()]}, "^1 generators for 2 images; give one, or one for each$"),
         ({"memory_tokens": random_tokens(1, 5)}, "^memory_tokens of 1 samples, but 2 images$"),
         ({"callback_on_step_end_tensor_inputs": ["prompt"]}, "tensor_inputs has prompt; known: latents$"),
+        ({"interactions": [(None,) * 3] * 2}, "^interactions of 3 steps; a clip of this model has 8$"),
     ],
 )
 def test_arguments_that_cannot_be_sampled_are_refused(changes, cause):
     with pytest.raises(PersistError, match=cause):
         call(WorldPipeline.of(trained()), **changes)
+
+
+@pytest.mark.parametrize("changes", [{"memory_tokens": random_tokens(2, 5)}, {"guidance_scale": 2.0}])
+def test_a_memory_is_refused_where_no_adapter_reads_it(changes):
+    backbone = trained()
+    backbone.use_adapter(None)
+    with pytest.raises(PersistError, match=r"^this model uses no memory adapter"):
+        call(WorldPipeline.of(backbone), **PLAIN | changes)
+
+
+def test_depth_that_is_not_finite_is_missing_and_whole_numbers_are_no_metres():
+    depth = torch.full((2, 32, 32), 2.0)
+    depth[:, 3], depth[:, 4], depth[:, 5] = torch.nan, torch.inf, -1.0
+    metres = batch_of_depth(depth)
+    assert not metres[:, 3:6].any()
+    assert torch.equal(metres[:, 6:], depth[:, 6:])
+    with pytest.raises(PersistError, match=r"^depth of torch.int32; give floating point metres"):
+        batch_of_depth(np.full((32, 32), 2000, np.int32))
+    with pytest.raises(PersistError, match=r"^a floating point image of values up to 255; give them in \[0, 1\]$"):
+        batch_of_images(torch.full((3, 32, 32), 255.0))
 
 
 def test_images_depth_and_cameras_of_other_sizes_are_refused():
@@ -256,10 +280,11 @@ def test_one_call_makes_a_pipeline_of_a_checkpoint(checkpoints):
     backbone, base, stage2 = checkpoints
     assert same(call(persist_backbones.load(stage2)), call(WorldPipeline.of(backbone)))
     backbone.use_adapter(None)
-    plain = call(WorldPipeline.of(backbone))
-    assert same(call(persist_backbones.load(base)), plain)
-    assert same(call(persist_backbones.load(stage2, adapter="stage1")), plain)
-    assert persist_backbones.load(str(stage2), dtype="bfloat16").transformer.dtype == torch.bfloat16
+    plain = call(WorldPipeline.of(backbone), **PLAIN)
+    assert same(call(persist_backbones.load(base), **PLAIN), plain)
+    assert same(call(persist_backbones.load(stage2, adapter="stage1"), **PLAIN), plain)
+    for dtype in ("bfloat16", torch.bfloat16):
+        assert persist_backbones.load(str(stage2), dtype=dtype).transformer.dtype == torch.bfloat16
 
 
 def test_a_checkpoint_that_cannot_be_loaded_is_refused(checkpoints, tmp_path):

@@ -188,12 +188,13 @@ def test_the_command_writes_episodes_that_can_be_read(persist: Persist, tmp_path
         (("--split", "held-out"), "unknown split"),
         (("--goals", "seen"), "unknown --goals 'seen'; known: both, in-sight, hidden"),
         (("--goal-gap", "inf"), "--goal-gap inf: give metres, 0 for none"),
+        (("--out", "/"), "/: a folder; name a file to write"),
     ],
 )
 def test_bad_options_of_episodes_are_one_line(
     persist: Persist, tmp_path: Path, options: tuple[str, str], message: str
 ) -> None:
-    ended = persist("bench", "episodes", *options, "--out", tmp_path / "episodes.json")
+    ended = persist("bench", "episodes", "--out", tmp_path / "episodes.json", *options)
     assert ended.code == 1
     assert message in ended.err
     assert not list(tmp_path.iterdir())

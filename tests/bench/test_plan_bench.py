@@ -19,6 +19,7 @@ from persist_cli.api.policy import Policy
 from persist_cli.bench.episodes import EpisodeSet
 from persist_cli.bench.navigator import Navigator, PlanSettings, RowParts, make_planner
 from persist_cli.bench.plan_bench import EpisodeSource, check_scenes, known_scenes, trained_policy
+from persist_cli.bench.planning_journal import check_row_folders
 from persist_cli.bench.planning_pictures import end_words
 from persist_cli.bench.rows import PlanningRow
 from persist_cli.bench.true_scene import TrueScene
@@ -169,6 +170,14 @@ def test_two_rows_that_would_be_kept_in_one_place_are_refused(bench: Bench, tmp_
     assert (ended.code, "holds the row 'Straight', 'straight' would be kept there too" in ended.err) == (1, True)
 
 
+def test_rows_of_one_folder_are_refused_before_any_is_run() -> None:
+    memories = ("voxel_2", "none", "voxel-2")
+    rows = [PlanningRow(f"rank-8, {name}", "rank", "random", name, "image", False) for name in memories]
+    check_row_folders(rows[:2])
+    with pytest.raises(DataError, match="'rank-8, voxel_2' and 'rank-8, voxel-2' would be kept in one folder"):
+        check_row_folders(rows)
+
+
 def test_rows_can_be_added_but_other_settings_are_refused(bench: Bench) -> None:
     options = ("--cost", "distance", "--loops", "closed", "--patience", 1)
     assert bench(*options, "--rows", "random").code == 0
@@ -186,7 +195,7 @@ def test_a_file_of_episodes_is_known_by_what_it_holds_whatever_a_later_persist_a
     del held["goal_gap"]  # came later
     file.write_text(json.dumps(held))
     digest = hashlib.sha256(json.dumps(held, sort_keys=True).encode()).hexdigest()
-    assert EpisodeSource.of(file, "0:1", None, 1).identity() == {"sha256": digest}
+    assert EpisodeSource.of(file, None, None, None).identity() == {"sha256": digest}
 
 
 def test_a_benchmark_that_named_its_episodes_with_what_the_file_leaves_unset_goes_on(
@@ -198,7 +207,7 @@ def test_a_benchmark_that_named_its_episodes_with_what_the_file_leaves_unset_goe
     file.write_text(json.dumps(held))
     assert bench(*options, "--patience", 1).code == 0
     plan = tmp_path / "bench/parts/plan.json"
-    source, values = EpisodeSource.of(file, "0:1", None, 1), json.loads(plan.read_text())
+    source, values = EpisodeSource.of(file, None, None, None), json.loads(plan.read_text())
     assert values["episodes"] == source.identity() != source.identity(unset=True)
     plan.write_text(json.dumps(values | {"episodes": source.identity(unset=True)}))
     assert bench(*options, "--patience", 1).code == 0
@@ -342,6 +351,9 @@ def test_a_world_model_is_ranked_by_what_it_imagines(bench: Bench, voxel: Path, 
         ((*PLACE, "--loops", "shut"), "unknown loop 'shut'"),
         ((*PLACE[:2], "--rows", "random", "--bins", "64"), "no episode of 64 actions"),
         (("--cost", "distanc"), "did you mean 'distance'"),
+        (("--seconds", "inf"), "a budget of inf seconds; give --seconds above 0"),
+        (("--stop-cost", "nan"), "--stop-cost nan: give a finite number"),
+        (("--episodes", "e.json", "--each", 3), "--scenes and --each: of episodes that are drawn"),
         ((*SEARCH, "--set", "method.elits=0.1"), "unknown key 'elits', did you mean 'elites'?"),
         ((*SEARCH, "--set", "method.elites=2"), "elites 2 is a share"),
         ((*SEARCH, "--set", "method.horizon=4"), "--set method.horizon: give --horizon"),
@@ -357,7 +369,7 @@ def test_a_world_model_is_ranked_by_what_it_imagines(bench: Bench, voxel: Path, 
         ((*PLACE, "--save-memory", "vae-slicing"), "how to sample is given, but no row has the world model"),
         ((*PLACE, "--stop-cost", 0.2), "--stop-cost 0.2: agents that are told the place of their goal stop there"),
         ((*PLACE, "--frames", 0), "a budget of 0 frames imagines nothing"),
-        ((*PLACE, "--seconds", "nan"), "a budget of nan seconds imagines nothing"),
+        ((*PLACE, "--seconds", "nan"), "a budget of nan seconds"),
         (("--cost", "distance", "--rows", "policy", "--policy", "rndom"), "unknown policy 'rndom'"),
     ],
 )

@@ -174,6 +174,12 @@ def test_adapters_that_are_sampled_in_other_ways_need_options_that_say_how(persi
     assert find_checkpoint(tmp_path / "m").sampling == Sampling(4, "unipc")
 
 
+def test_a_protocol_is_named_once(persist, runs, tmp_path):
+    twice = ("--sampling-for", "return:steps=3", "--sampling-for", "return:guidance=2")
+    ended = persist("export", runs / "stage1", *twice, "--out", tmp_path / "m")
+    assert (ended.code, "--sampling-for: return is named twice" in ended.err) == (1, True), ended.err
+
+
 @pytest.mark.parametrize(
     ("text", "cause"),
     [

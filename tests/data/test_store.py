@@ -154,6 +154,9 @@ def test_a_wrong_frame_is_named_and_nothing_is_written(
         ({"intrinsics": np.zeros((3, 3))}, "singular"),
         ({"intrinsics": np.full((3, 3), np.nan)}, "singular"),
         ({"intrinsics": np.eye(4)}, "shape"),
+        ({"intrinsics": np.array([[9.0, 0, 0], [0, 9, 0], [4, 3, 1]])}, "not a pinhole matrix; they look transposed"),
+        ({"intrinsics": np.array([[1.0, 1, 0], [1, 1, 0], [0, 0, 1]])}, "not a pinhole matrix$"),
+        ({"source": {"fps": np.float32(30)}}, "its source must hold values of JSON"),
         ({"world_up": (0.0, 0.0, 0.0)}, "unit vector"),
         ({"height": 0}, "image size"),
     ],
@@ -161,6 +164,12 @@ def test_a_wrong_frame_is_named_and_nothing_is_written(
 def test_a_wrong_camera_is_refused(tmp_path: Path, change: dict[str, object], cause: str) -> None:
     with pytest.raises(DataError, match=cause):
         write_trajectory(tmp_path / "one.parquet", replace(INFO, **change), make_frames(2))
+
+
+def test_a_camera_may_have_values_of_numpy(tmp_path: Path) -> None:
+    info = replace(INFO, height=np.int64(INFO.height), world_up=tuple(np.array(INFO.world_up, np.float32)))
+    write_trajectory(tmp_path / "one.parquet", info, make_frames(2))
+    assert Store(tmp_path)["one"].info.world_up == INFO.world_up
 
 
 def test_a_trajectory_without_frames_is_refused(tmp_path: Path) -> None:

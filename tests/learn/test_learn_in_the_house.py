@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,8 +18,10 @@ from persist_cli.bench.episodes import EpisodeSet
 from persist_cli.bench.find_episodes import EpisodeSearch, find_episodes
 from persist_cli.bench.run_episode import run_closed_loop
 from persist_cli.data.store import Store, write_trajectory
+from persist_cli.errors import DataError
 from persist_cli.io.files import read_json, write_json
 from persist_cli.io.sha256sums import write_sums
+from persist_cli.learn.learn import open_simulator
 from persist_cli.metrics.lpips import ALEX, tensor_shapes
 from persist_cli.policies.trained import find_policy, write_policy_card
 from persist_cli.simulators.miniworld import MiniWorld
@@ -177,3 +181,15 @@ def test_weights_that_are_missing_are_an_error_before_anything_is_done(learn, tm
     assert (result.code, result.err.count("\n")) == (1, 1)
     assert "persist weights fetch lpips-alex; or --stop-cost 0, to stop only where the policy does" in result.err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("look", [{"light": 0.3}, {"depth_sensor": "kinect"}])
+def test_views_of_another_look_are_refused_where_the_true_house_is_looked_at(
+    world: MiniWorld, look: dict[str, Any]
+) -> None:
+    world.open_scene(HOUSE)
+    info = replace(world.info, source=world.info.source | {"camera": look})
+    plan: Any = SimpleNamespace(views=("dark#0",))
+    open_simulator(plan, world.info)
+    with pytest.raises(DataError, match=f"dark#0: collected with {next(iter(look))} of their own, which the true"):
+        open_simulator(plan, info)

@@ -147,7 +147,7 @@ PLACE = ("--cost", "distance")
         (("--over", "lst"), "unknown --over 'lst'; did you mean 'last'?"),
         ((*PLACE, "--frames", 0), "a budget of 0 frames imagines nothing"),
         ((*PLACE, "--frames", 2), "a budget of 2 frames does not suffice for one candidate of 3 actions"),
-        ((*PLACE, "--seconds", 0), "a budget of 0 seconds imagines nothing"),
+        ((*PLACE, "--seconds", 0), "a budget of 0 seconds"),
         ((*PLACE, "--actions", "forward,jump"), "unknown action 'jump'"),
         ((*PLACE, "--set", "policy.weights={left: 1}"), "policy.weights: no policy proposes here; name one"),
         ((*PLACE, "--set", "method.elites=2"), "elites 2 is a share"),

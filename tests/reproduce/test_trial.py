@@ -21,9 +21,9 @@ LINES = [*scenes.commands(scenes.SceneFigures(OUT)), *table1.commands(OUT), *tab
 
 
 LIMITS = {
-    "eval": {"clips": 2, "seeds": 1, "steps": 1}, "bench": {"images": 2, "houses": 2},
+    "eval": {"clips": 2, "seeds": 1, "steps": 1}, "bench": {"images": 2},
     "walk": {"walks": 1, "walk_steps": 8, "seeds": 1}, "return": {"walks": 1, "return_steps": 8, "seeds": 1},
-    "completion": {"seeds": 1}, "edits": {"edits": 2}, "evolution": {"interactions": 2, "seeds": 1},
+    "completion": {"seeds": 1, "houses": 2}, "edits": {"edits": 2}, "evolution": {"interactions": 2, "seeds": 1},
 }  # fmt: skip
 
 

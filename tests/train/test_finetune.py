@@ -17,11 +17,8 @@ from PIL import Image
 
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.io.files import read_tensors
-from persist_cli.recipe import make_recipe, read_recipe
-from persist_cli.train.finetune import next_command
 from persist_cli.train.log import StepLog
 from persist_cli.train.trainer import Trainer
-from tests.support.command_lines import parse_line
 from tests.support.damage import without_sums
 from tests.support.disk import file_limit
 from tests.support.micro_runs import (
@@ -396,48 +393,6 @@ def test_a_finished_run_says_where_it_is_and_the_next_command(persist, walks, ex
     ended = persist(*again, "training.steps=3", "--resume")
     assert f"checkpoint in {extended / 'base'}\n" in ended.out
     assert f"next: persist finetune tiny-stage2-voxel --data {walks} base={extended / 'base'}\n" in ended.out
-
-
-@pytest.mark.parametrize(
-    ("recipe", "following"),
-    [
-        ("houses-64-codec", "houses-64-stage1"), ("cogvideox-2b-stage1-lora", "cogvideox-2b-stage2-voxel"),
-        ("houses-64-stage1-rgb", "houses-64-stage2-voxel-rgb"), ("mine.yaml", "RECIPE"),
-    ],
-)  # fmt: skip
-def test_the_next_stage_is_of_the_same_recipes(recipe, following):
-    values = {"stage": "codec" if "codec" in recipe else "1", "data": {"path": "d"}}
-    command = next_command(recipe, make_recipe(values, recipe), Path("run"))
-    assert command == f"persist finetune {following} --data d base=run"
-
-
-@pytest.mark.parametrize(("name", "following"), [("tiny-scene-codec", "tiny-scene"), ("my-codec.yaml", "RECIPE")])
-def test_after_the_codec_of_scenes_comes_the_model_of_the_same_recipes(name, following):
-    recipe = make_recipe(read_recipe("tiny-scene-codec") | {"data": {"path": "d"}}, name)
-    assert next_command(name, recipe, Path("run")) == f"persist finetune {following} --data d base=run"
-
-
-def test_a_run_goes_on_with_its_data_at_another_place_and_with_no_others(persist, walks, codec, tmp_path):
-    data, moved = tmp_path / "data", tmp_path / "moved"
-    shutil.copytree(walks, data)
-    run = stage("stage1", data, tmp_path / "run", f"base={codec}", "training.steps=1")
-    assert persist(*run).code == 0
-    data.rename(moved)
-    again = [str(moved) if word == str(data) else word for word in run]
-    assert persist(*again, "training.steps=2", "--resume").code == 0
-    assert not (tmp_path / "run/data.json").read_text().count(str(tmp_path))
-    sorted(moved.glob("*.parquet"))[0].unlink()
-    ended = persist(*[str(walks) if word == str(data) else word for word in run], "training.steps=3", "--resume")
-    assert ended.code == 0  # whole again
-    moved.rename(data)
-    assert "data.path changed" in persist(*run, "training.steps=4", "--resume").err
-
-
-def test_a_scene_model_is_measured_next_with_a_data_set_of_its_training(tmp_path):
-    recipe = make_recipe(read_recipe("tiny-scene") | {"data": {"path": ["one", "two"]}}, "tiny-scene")
-    command = next_command("tiny-scene", recipe, tmp_path)
-    parse_line(command.removeprefix("persist "))
-    assert "--train one --out" in command
 
 
 @pytest.fixture

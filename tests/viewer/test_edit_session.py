@@ -1,14 +1,19 @@
 """Editing by hand, without a page: what is selected, done, taken back and saved."""
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
+from persist_cli.api.actions import rotation_about
 from persist_cli.api.cells import FREE, Box, CellOrigin
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError, PersistError
 from persist_cli.memorize.memory_file import load_memory, load_paths
 from persist_cli.viewer.drawn_cells import cells_of_memory
+from persist_cli.viewer.edit_order import middle_of
 from persist_cli.viewer.edit_session import EditSession, Selected, default_out
 from tests.support.cell_rooms import TABLE_CELLS, camera_at
 
@@ -185,6 +190,21 @@ def test_a_thing_is_inserted_on_what_stands_in_the_middle_of_the_selection(sessi
     session.select_thing("table#1")
     session.insert("box")
     assert [thing.name for thing in session.things].count("box#2") == 1
+
+
+@pytest.mark.parametrize("degrees", [0, -20, 31])
+def test_a_thing_is_inserted_in_the_middle_of_the_selection_whichever_way_is_up(session, monkeypatch, degrees):
+    turn = rotation_about(torch.tensor([1.0, 0.0, 0.0]), math.radians(degrees))
+    up = turn @ torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    reference = replace(session.original.reference, world_up=tuple(up.tolist()))
+    monkeypatch.setattr(session.original, "reference", reference)
+    asked = []
+    monkeypatch.setattr(session, "apply", asked.extend)
+    session.select_thing("table#1")
+    session.insert("box")
+    at = torch.tensor([value or 0.0 for value in asked[0].at], dtype=torch.float64)
+    middle = torch.tensor(middle_of(session._selected()[0]), dtype=torch.float64)
+    assert torch.linalg.cross(middle - at, up).norm() < 0.01  # apart along up alone
 
 
 def test_a_box_of_a_voxel_map_is_painted(voxel_map, tmp_path):

@@ -255,6 +255,9 @@ class Adapter(nn.Module, ABC, Generic[Prepared]):
             learned=len(self.learned),
         )
 
+    def check_latents(self, height: int, width: int) -> None:
+        """Raise ``CheckpointError`` when settings do not go with images of so many latent pixels; most go with any."""
+
     def noisy(
         self, tokens: MemoryTokens, level: Float[Tensor, " batch"], generators: list[torch.Generator]
     ) -> MemoryTokens:

@@ -63,6 +63,12 @@ class FramesAdapter(Adapter[PreparedMemory]):
         self.origin = nn.Embedding(max(Origin) + 1, settings.width)
         self.blocks = memory_blocks(settings, video, video.camera_channels)
 
+    def check_latents(self, height: int, width: int) -> None:
+        """Raise ``CheckpointError`` when frames cannot be cut into whole patches."""
+        patch = self.settings.frame_patch
+        if height % patch or width % patch:
+            raise CheckpointError(f"adapter.frame_patch is {patch}; it must divide {height}×{width} latent pixels")
+
     def render(self, tokens: MemoryTokens, cameras: Cameras, encode: Encode) -> MemoryTokens:
         """Encode the images of the tokens, which are not needed afterwards.
 

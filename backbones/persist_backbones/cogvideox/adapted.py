@@ -141,5 +141,7 @@ class AdaptedBackbone(Backbone):
         self._take_adapter(name, load_adapter(folder, self.video_shape))
 
     def _take_adapter(self, name: str, adapter: Adapter[Any]) -> None:
+        height, width = (side // self.codec.spatial for side in self.image_size)
+        adapter.check_latents(height, width)
         self.adapters[name] = adapter.to(self.device)
         self.adapter_name = name

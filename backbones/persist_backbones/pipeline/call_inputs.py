@@ -14,6 +14,8 @@ from persist_cli.api.cameras import Cameras
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import DataError
 
+BRIGHTEST = 1.01  # of floating point images, which are in [0, 1] but for rounding
+
 
 def make_clips(
     images: Tensor,
@@ -53,6 +55,9 @@ def make_clips(
     for name, count in counts.items():
         if count != batch:
             raise DataError(f"{name} of {count} samples, but {batch} images")
+    wrong = next((len(one) for one in steps if len(one) != frames - 1), None)
+    if wrong is not None:
+        raise DataError(f"interactions of {wrong} steps; a clip of this model has {frames - 1}")
     return Clips(images[:, None], metres[:, None], path, steps, memory, seeds=range(batch))
 
 
@@ -72,6 +77,8 @@ def batch_of_images(images: Any) -> Tensor:
         images = torch.from_numpy(np.array(pixels))
     _check_images(images)
     if images.is_floating_point():
+        if images.amax() > BRIGHTEST:
+            raise DataError(f"a floating point image of values up to {float(images.amax()):g}; give them in [0, 1]")
         images = (images.movedim(-3, -1) * 255).round().clamp(0, 255).to(torch.uint8)
     batch: Tensor = images.reshape(-1, *images.shape[-3:])
     return batch
@@ -89,10 +96,17 @@ def _check_images(images: Tensor) -> None:
 
 
 def batch_of_depth(depth: Any) -> Tensor:
-    """Convert depth of one sample, a batch or a list to metres ``[batch, height, width]``."""
+    """Convert depth of one sample, a batch or a list to metres ``[batch, height, width]``, 0 where none is known.
+
+    Raises:
+        DataError: when it is of whole numbers, which are millimetres as a rule.
+    """
     if isinstance(depth, (list, tuple)):
         return torch.cat([batch_of_depth(sample) for sample in depth])
-    metres = torch.as_tensor(depth).float()
+    metres = torch.as_tensor(depth)
+    if not metres.is_floating_point():
+        raise DataError(f"depth of {metres.dtype}; give floating point metres, as depth / 1000 of millimetres")
+    metres = torch.where(metres.isfinite() & (metres > 0), metres, 0).float()
     return metres.reshape(-1, *metres.shape[-2:])
 
 

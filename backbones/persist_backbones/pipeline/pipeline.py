@@ -184,7 +184,7 @@ class WorldPipeline(OffloadingPipeline):
             PersistError: one line for inputs that do not fit each other or the model.
         """
         sampling, backbone = Sampling(num_inference_steps, self._sampler(), guidance_scale), self.backbone
-        self._check(sampling, output_type, callback_on_step_end_tensor_inputs)
+        self._check(sampling, output_type, callback_on_step_end_tensor_inputs, memory_tokens is not None)
         images = self._images(image)
         first = make_clips(images, depth, cameras, interactions, memory_tokens, backbone.frames_per_clip)
         generators = generators_for(generator, len(images))
@@ -221,8 +221,10 @@ class WorldPipeline(OffloadingPipeline):
             )
         return name
 
-    def _check(self, sampling: Sampling, output_type: str, tensors: Sequence[str]) -> None:
+    def _check(self, sampling: Sampling, output_type: str, tensors: Sequence[str], remembers: bool) -> None:
         self.backbone.check_sampling(sampling)
+        if self.backbone.adapter is None and (remembers or sampling.memory_guidance != 1):
+            raise PersistError("this model uses no memory adapter, which reads memory_tokens; load(…, adapter=NAME)")
         if output_type not in OUTPUTS:
             raise PersistError(f"unknown output_type {output_type!r}; known: {', '.join(OUTPUTS)}")
         unknown = set(tensors) - set(self._callback_tensor_inputs)
@@ -252,6 +254,7 @@ def generators_for(generator: torch.Generator | list[torch.Generator] | None, ba
 
 def load_pipeline(folder: Path, adapter: str | None, dtype: Precision | None) -> WorldPipeline:
     """Load a checkpoint as a pipeline; see ``persist_backbones.load``."""
+    dtype = str(dtype).removeprefix("torch.") if isinstance(dtype, torch.dtype) else dtype
     if dtype is not None and dtype not in get_args(Precision):
         raise CheckpointError(f"unknown dtype {dtype!r}; {hint(dtype, get_args(Precision))}")
     checkpoint = find_checkpoint(folder)

@@ -243,7 +243,8 @@ def _insert(grid: CellGrid, edit: Insert) -> None:
     """Put a block of cells of a class where its lowest face has its middle, or upon what is there."""
     kind, size = _kind(grid, edit.kind), grid.form.size
     rests = None in edit.at
-    if rests and [value is None for value in edit.at] != [bool(part > 0.5) for part in grid.axes[2].abs()]:
+    height = int(grid.axes[2].abs().argmax())
+    if rests and [value is None for value in edit.at] != [axis == height for axis in range(3)]:
         raise DataError(f"at {_point_text(edit.at)}: the height alone can be left open")
     extent, color = _usual(grid, edit)
     counts = (extent / size).round().clamp(min=1)

@@ -13,6 +13,7 @@ from persist_cli.evaluate.report.remarks import (
     new_poses_line,
     other_samplings,
     sampling_line,
+    seed_legend,
     too_few_lines,
     without_command,
 )
@@ -92,14 +93,12 @@ def _caption(results: EvalResults, table: CompactTable) -> str:
     view = table.view
     measured, protocol = results.measured, results.measured.protocol
     height, width = measured.image_size
-    seeds = len(results.sampling.seeds)
     domain = f" ({view.name})" if len(results.tables) > 1 else ""
-    clips = f"{view.clips} clips of {protocol.frames} frames at {height}×{width}"
+    clips = f"{counted(view.clips, 'clips')} of {protocol.frames} frames at {height}×{width}"
     clips += f", {counted(view.units, 'scenes')}" * (view.unit == "scenes")
     notes = [f"({number}) {without_command(note)}" for number, note in view.notes.items()]
-    deviation = f"mean ± standard deviation over {seeds} sampling seeds" if seeds > 1 else "one sampling seed"
     sampled = "".join(f"; {line}" for line in (sampling_line(results), *other_samplings(results)) if line)
-    text = f"{protocol.title or protocol.name}{domain}: {clips}; {deviation}{sampled}"
+    text = f"{protocol.title or protocol.name}{domain}: {clips}; {seed_legend(results)}{sampled}"
     return escape(" ".join(f"{sentence}." for sentence in [text, *notes]))
 
 

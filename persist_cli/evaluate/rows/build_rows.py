@@ -94,6 +94,8 @@ class RowConfig:
         for name in self.sampling_of:
             if name not in self.memories:
                 raise PersistError(f"--sampling-of {name}: no such memory; {hint(name, list(self.memories))}")
+        if self.noise != RowConfig.noise and not {"noisy", "drifting"} & {*self.controls}:
+            raise PersistError("--pose-noise: only with --controls noisy or drifting, which write wrong poses")
         if not all(0 <= deviation < math.inf for deviation in self.noise):
             raise PersistError(
                 f"--pose-noise {self.noise[0]:g} {self.noise[1]:g}: give two finite numbers of at least 0"
@@ -214,9 +216,9 @@ def intervention_rows(
     """
     named = [(name, make(config, cases)) for name, make in INTERVENTIONS.items() if name in config.controls]
     for name, intervention in named:
-        scenes_only = intervention.memories is not Memory
-        if scenes_only and config.named and not any(takes(row, intervention) for row in models):
-            raise PersistError(f"the control {name!r} needs a scene among --memories; leave it out of --controls")
+        if config.named and not any(takes(row, intervention) for row in models):
+            kind = "memory that is read" if intervention.memories is Memory else "scene"
+            raise PersistError(f"the control {name!r} needs a {kind} among --memories; leave it out of --controls")
     for row in models:
         yield from ((name, changed_by(row, made)) for name, made in named if takes(row, made))
 

@@ -98,6 +98,15 @@ def test_captions_name_no_command():
     assert "persist weights" not in latex
 
 
+@pytest.mark.parametrize("own_seeds", [1, 3])
+def test_the_caption_says_what_deviations_are_over(own_seeds):
+    results = example_results()
+    for row in results["tables"][0]["rows"].values():
+        row["training_seeds"] = [[seed] for seed in range(own_seeds)]
+    latex = latex_tables(check_results(results, "example"))
+    assert ("over training seeds where a row has several" in latex) is (own_seeds > 1)
+
+
 def test_tables_of_five_clips_have_no_interval_and_no_star_and_say_why():
     results = example_results(clips=5)  # with intervals, as earlier versions wrote them
     text, latex = table_text(results), latex_tables(check_results(results, "example"))
