@@ -48,7 +48,7 @@ def view(
     from persist_cli.viewer.view import Address, ViewPlan, run_view
 
     if export is not None:
-        unused = "start out checkpoint adapter seed host port"
+        unused = "out checkpoint adapter seed host port"
         refuse_options(context, unused, "not with --export, which writes a page that edits and imagines nothing")
     plan = ViewPlan(source, truth, start, ImagineSettings(checkpoint, adapter, seed), out, most, seed)
     run_view(plan, Address(host, port, opens), export, json)

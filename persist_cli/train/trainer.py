@@ -177,11 +177,11 @@ class Trainer(TrainingLoop[Backbone]):
 
 def scenes_of(clips: ClipDataset) -> TrainingScenes:
     """The scenes of all clips, and the views that cameras have in random windows too."""
-    names, crop = frozenset(trained_scene(file.info) for file in clips.files), clips.plan.augmentation.crop
-    views = []
+    names, views = frozenset(trained_scene(file.info) for file in clips.files), list[float]()
     for info in (file.info for file in clips.files):
-        size = (info.height, info.width)
-        largest = crop_resize(size, clips.plan.image_size).window[0] / info.height if crop < 1 else 1.0
+        crop, largest = clips.plan.augmentation.crop, 1.0
+        if crop < 1:
+            largest = crop_resize((info.height, info.width), clips.plan.image_size).window[0] / info.height
         views += [vertical_view(info, crop * largest), vertical_view(info, largest)]
     return TrainingScenes(names, fov=(min(views), max(views)) if views else None)
 

@@ -214,15 +214,27 @@ def test_stage_1_is_compared_with_the_stage_2_that_stands_on_it(persist):
 
 def test_stage_2_is_compared_on_the_model_of_this_stage_1_whatever_else_this_is_given(persist):
     def stage2(*settings):
-        words = ("houses-64-stage1", "backbone.settings.image_noise=0.2", *settings, "--gpus", "1", "--json")
-        ended = persist("doctor", *words, "--gpu-memory", "8")
+        words = (
+            "tiny-stage1",
+            *MICRO,
+            *SAVING,
+            "base=nowhere",
+            *settings,
+            "--gpus",
+            "1",
+            "--gpu-memory",
+            "8",
+            "--json",
+        )
+        ended = persist("doctor", *words)
         assert ended.code == 0, ended.err
         return json.loads(ended.out)["strategies"][-1]
 
     plain = stage2()
-    assert (plain["name"], plain["recipe"]) == ("stage 2 only", "houses-64-stage2-voxel")
-    assert stage2("training.accumulation=32", "training.cooldown=2000")["need"] == plain["need"]
-    wider = stage2("backbone.settings.transformer.num_layers=12")
+    assert (plain["name"], plain["recipe"]) == ("stage 2 only", "tiny-stage2-voxel")
+    others = ("training.accumulation=2", "training.steps=9000", "training.cooldown=8000", "data.strides=[1,-1]")
+    assert stage2(*others)["need"] == plain["need"]
+    wider = stage2("backbone.settings.transformer.num_layers=4")
     assert wider["need"]["weights"] > plain["need"]["weights"]
 
 
