@@ -13,7 +13,9 @@ from diffusers import (
     CogVideoXDPMScheduler,
     CogVideoXImageToVideoPipeline,
     CogVideoXTransformer3DModel,
+    DPMSolverMultistepScheduler,
     EulerDiscreteScheduler,
+    UniPCMultistepScheduler,
 )
 from PIL import Image
 
@@ -187,8 +189,29 @@ def test_replacing_the_scheduler_changes_the_sampler():
     pipeline.scheduler = CogVideoXDPMScheduler.from_config(pipeline.scheduler.config)
     output, (rgb, _) = call(pipeline), backbone.generate(CLIPS, Sampling(3, "dpm", 1.5))
     assert torch.equal((output.frames.movedim(2, -1) * 255).round().to(torch.uint8), rgb)
+    for kind, name in ((UniPCMultistepScheduler, "unipc"), (DPMSolverMultistepScheduler, "dpm++")):
+        pipeline.scheduler = kind.from_config(pipeline.scheduler.config)
+        output, (rgb, _) = call(pipeline), backbone.generate(CLIPS, Sampling(3, name, 1.5))
+        assert torch.equal((output.frames.movedim(2, -1) * 255).round().to(torch.uint8), rgb)
     pipeline.scheduler = EulerDiscreteScheduler()
     with pytest.raises(PersistError, match=r"^scheduler EulerDiscreteScheduler does not keep to training"):
+        call(pipeline)
+
+
+@pytest.mark.parametrize(
+    ("make", "cause"),
+    [
+        (lambda config: CogVideoXDDIMScheduler(prediction_type=config.prediction_type, beta_end=0.02), "not training"),
+        (lambda config: UniPCMultistepScheduler(beta_end=0.03), "has not training's noise; make it by from_config"),
+        (lambda config: UniPCMultistepScheduler.from_config(config, solver_order=1), "nothing reads solver_order"),
+        (lambda config: DPMSolverMultistepScheduler.from_config(config, use_karras_sigmas=True, solver_order=3),
+         "nothing reads solver_order, use_karras_sigmas"),
+    ],
+)  # fmt: skip
+def test_a_scheduler_of_other_noise_or_with_options_that_nothing_reads_is_refused(make, cause):
+    pipeline = WorldPipeline.of(trained())
+    pipeline.scheduler = make(pipeline.scheduler.config)
+    with pytest.raises(PersistError, match=cause):
         call(pipeline)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -16,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from persist_backbones.cogvideox.config import CogVideoXSettings
-from persist_backbones.cogvideox.diffusion import SAMPLERS, SamplingStep
+from persist_backbones.cogvideox.diffusion import MULTISTEP, SAMPLERS, SamplingStep
 from persist_backbones.cogvideox.parts import DiffusersParts
 from persist_backbones.extensions.extended import ExtendedCogVideoX
 from persist_backbones.extensions.offload import OffloadingPipeline
@@ -35,6 +36,10 @@ from persist_cli.io.settings import parse_settings
 Callback = Callable[["WorldPipeline", int, Tensor, dict[str, Tensor]], dict[str, Tensor]]
 
 NAME = "cogvideox"  # of the plugin
+OF_NOISE = frozenset({  # options of schedulers that a configuration of training has, or that follow from it
+    "num_train_timesteps", "beta_start", "beta_end", "beta_schedule", "trained_betas", "prediction_type",
+    "timestep_spacing", "steps_offset", "rescale_betas_zero_snr",
+})  # fmt: skip
 OUTPUTS = ("pil", "np", "pt", "latent")
 
 
@@ -79,6 +84,7 @@ class WorldPipeline(OffloadingPipeline):
     ) -> None:
         super().__init__()
         self.register_modules(transformer=transformer, vae=vae, scheduler=scheduler, world=world, adapter=adapter)
+        self._noise = noise_of(scheduler)
         self._assembled: tuple[ExtendedCogVideoX, tuple[Any, ...]] | None = None
         self._guidance_scale = 1.0
         self._num_timesteps = 0
@@ -219,6 +225,7 @@ class WorldPipeline(OffloadingPipeline):
             raise CheckpointError(
                 f"scheduler {type(self.scheduler).__name__} does not keep to training's noise; use {known}"
             )
+        check_scheduler(self.scheduler, self._noise)
         return name
 
     def _check(self, sampling: Sampling, output_type: str, tensors: Sequence[str], remembers: bool) -> None:
@@ -237,6 +244,33 @@ class WorldPipeline(OffloadingPipeline):
             return WorldPipelineOutput(latents, None)
         colors, metres = self.backbone.decode(latents, first)
         return WorldPipelineOutput(VideoProcessor().postprocess_video(colors, output_type), metres)
+
+
+def noise_of(scheduler: Any) -> tuple[Tensor, str]:
+    """Return the signal left at each noise level, and what is predicted, as a scheduler's configuration has it."""
+    trained = CogVideoXDDIMScheduler.from_config(scheduler.config)
+    return trained.alphas_cumprod, str(trained.config.prediction_type)
+
+
+def check_scheduler(scheduler: Any, noise: tuple[Tensor, str]) -> None:
+    """Raise ``CheckpointError`` for a scheduler of other noise than training's, or with options that nothing reads.
+
+    Args:
+        scheduler: a scheduler of ``SAMPLERS``.
+        noise: what ``noise_of`` said of that of training.
+    """
+    name, (levels, prediction) = type(scheduler).__name__, noise_of(scheduler)
+    if prediction != noise[1] or not torch.equal(levels, noise[0]):
+        raise CheckpointError(
+            f"scheduler {name} has not training's noise; make it by from_config(pipe.scheduler.config)"
+        )
+    if type(scheduler) not in MULTISTEP.values():
+        return
+    options = inspect.signature(type(scheduler)).parameters.items()
+    own = {key: option.default for key, option in options if key not in OF_NOISE}
+    unread = [key for key, usual in own.items() if scheduler.config.get(key, usual) != usual]
+    if unread:
+        raise CheckpointError(f"scheduler {name}: nothing reads {', '.join(unread)}; leave them as they are by default")
 
 
 def generators_for(generator: torch.Generator | list[torch.Generator] | None, batch: int) -> list[torch.Generator]:
