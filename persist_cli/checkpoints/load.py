@@ -78,10 +78,14 @@ def with_scene_paths(values: Mapping[str, Any]) -> dict[str, Any]:
     return {**values, "memory": {**memory, "settings": with_absolute_model(memory["settings"])}}
 
 
-def with_adapter(values: Mapping[str, Any]) -> dict[str, Any]:
+def with_adapter(values: Mapping[str, Any], begun: Path | None = None) -> dict[str, Any]:
     """Plain values of a recipe, with the memory of the adapter that ``adapter_from`` names, where it names one.
 
     Settings of that memory which do not change what is read, such as the model of a scene, may be the recipe's own.
+
+    Args:
+        values: the plain values.
+        begun: a run that began with that adapter and goes on: its own reads the same memory, and is there.
 
     Raises:
         PersistError: when that adapter is not there, or the recipe has settings of its own for it or its memory.
@@ -91,7 +95,7 @@ def with_adapter(values: Mapping[str, Any]) -> dict[str, Any]:
     own_memory = values.get("memory") or {}
     if not isinstance(own_memory, Mapping) or not isinstance(own_memory.get("settings") or {}, Mapping):
         return dict(values)  # a recipe of them is refused
-    checkpoint, name = named_adapter(str(values["adapter_from"]))
+    checkpoint, name = named_adapter(str(begun or values["adapter_from"]))
     memory = _merged(dataclasses.asdict(adapter_memory(checkpoint, name)), values.get("memory"))
     own = ["memory"] * (memory is None) + ["adapter"] * (values.get("adapter") not in (None, {}))
     if own:

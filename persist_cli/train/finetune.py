@@ -76,6 +76,7 @@ from persist_cli.train.sources import (
     held_sources,
     known_hashes,
     knows_scene_model,
+    with_own_adapter,
 )
 from persist_cli.train.state import load_state
 from persist_cli.train.tensor_cache import CacheSettings
@@ -114,10 +115,11 @@ def run_finetune(plan: FinetunePlan) -> None:
     values = apply_overrides(read_recipe(plan.recipe), plan.overrides)
     if plan.data:
         values = apply_overrides(values, [f"data.path={json.dumps([str(folder) for folder in plan.data])}"])
-    recipe = make_recipe(with_scene_paths(with_adapter(values)), plan.recipe)
+    run = plan.out or Path("runs") / Path(plan.recipe).stem
+    begun = run if plan.resume and step_folders(run) and not values.get("distill") else None
+    recipe = make_recipe(with_scene_paths(with_adapter(values, begun)), plan.recipe)
     if not recipe.data.path:
         raise RecipeError(f"{plan.recipe}: no data set; give --data DIR")
-    run = plan.out or Path("runs") / Path(plan.recipe).stem
     check_run(run, recipe, plan.resume)
     with StopSignal() as stop, limited_threads(recipe.training.threads), explain_lost_processes(run):
         ended_by = finetune(recipe, run, stop, plan)
@@ -207,7 +209,7 @@ def prepare_trainer(
     if recipe.scene is not None:
         return SceneTrainer(recipe, *prepare_scene_model(recipe, run), accelerator, plan.cache)
     factory = MemoryFactory.of(recipe.memory, accelerator.device) if recipe.memory else None
-    backbone = prepare_backbone(recipe, base, factory)
+    backbone = prepare_backbone(with_own_adapter(recipe, run), base, factory)
     if accelerator.is_main_process and starts_from_random_codec(recipe, backbone):
         warn(f"{run}: {RANDOM_CODEC}")
     if accelerator.is_main_process and base and factory and recipe.distill is None and is_distilled(base):

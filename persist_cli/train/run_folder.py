@@ -24,7 +24,7 @@ from persist_cli.recipe import Recipe, to_yaml
 from persist_cli.train.log import SpeedLog, StepLog
 from persist_cli.train.policy_trainer import PolicyTrainer
 from persist_cli.train.scene_trainer import SceneTrainer
-from persist_cli.train.sources import named_model, write_hashes
+from persist_cli.train.sources import named_model, with_own_adapter, write_hashes
 from persist_cli.train.state import save_state
 from persist_cli.train.trainer import Trainer
 
@@ -62,7 +62,7 @@ class RunFolder:
         if trainer.accelerator.is_main_process:
             remove_leftovers(path)
             if base is not None:
-                self.scenes |= training_scenes(base) | source_scenes(trainer.recipe)
+                self.scenes |= training_scenes(base) | source_scenes(with_own_adapter(trainer.recipe, path))
                 self.recipes = stage_recipes(base.base_folder) if trainer.recipe.memory is None else {}
             path.mkdir(parents=True, exist_ok=True)
             write_text(path / RECIPE, to_yaml(trainer.recipe))

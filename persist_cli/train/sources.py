@@ -55,6 +55,16 @@ def distilled(recipe: Recipe) -> dict[str, str]:
     return {key: text for key, text in named.items() if text}
 
 
+def with_own_adapter(recipe: Recipe, run: Path) -> Recipe:
+    """The recipe with a run's own adapter, where it goes on, in the place of the one that it began with.
+
+    That one may be gone by then. Of a distillation it is held, as it is what is distilled.
+    """
+    if recipe.adapter_from is None or recipe.distill is not None or not step_folders(run):
+        return recipe
+    return replace(recipe, adapter_from=str(run))
+
+
 def known_hashes(run: Path) -> dict[str, str]:
     """The hashes of what a run distils, which ``write_hashes`` wrote; empty for a run that has not begun."""
     path = run / DISTILLED
