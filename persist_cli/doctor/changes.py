@@ -98,20 +98,20 @@ def available_changes(recipe: Recipe, machine: Machine, sharded: bool) -> list[C
     transformer, averaged = of_a_backbone and recipe.stage != "codec", training.ema and training.ema_device != "cpu"
     mixed = of_a_backbone and training.precision == "bf16"
     frozen, half = FROZEN if recipe.stage == "2" else FROZEN_UNSHARDED, training.frozen_precision == "bf16"
-    whole = recipe.distill is not None  # each process needs the whole model, with its averages
+    distilled = recipe.distill is not None  # by averages that stay on the device, and without LoRA
     can_shard = transformer and training.optimizer == "adamw" and not (half and frozen.unsharded_only)
     can_shard = can_shard and not needs_whole(recipe)
     fsdp = Change(f"FSDP over {machine.devices}", (), 2, (SHARDED,))
     changes: list[tuple[bool, Change]] = [
         (of_a_backbone and not training.vae_slicing, SLICING),
         (mixed and not half and not (sharded and frozen.unsharded_only), frozen),
-        (bool(averaged) and cuda and not whole, AVERAGE),
+        (bool(averaged) and cuda and not distilled, AVERAGE),
         (training.samples_at_once(machine.devices) > 1, _single_samples(recipe, machine)),
         (machine.devices > 1 and not sharded and can_shard, fsdp),
         (not training.gradient_checkpointing and transformer, CHECKPOINTING),
         (training.optimizer == "adamw" and cuda and not sharded, EIGHT_BIT),
         (cuda and can_shard, OFFLOAD),
-        (recipe.stage == "1" and recipe.lora is None and not whole and training.optimizer != "muon", LORA),
+        (recipe.stage == "1" and recipe.lora is None and not distilled and training.optimizer != "muon", LORA),
     ]
     return [change for available, change in changes if available]
 

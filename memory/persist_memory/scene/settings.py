@@ -8,10 +8,10 @@ from typing import Annotated, Literal
 from pydantic import Field, NonNegativeInt, PositiveInt
 
 from persist_cli.api.cells import COMMON
+from persist_memory.metres import Metres
 
 MOST_CELLS = 10_000_000  # of the box: some 500 MB, and at 0.25 m a house of 200 m by 200 m with four floors
 
-Length = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Distance = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Height = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -39,10 +39,10 @@ class GridSceneSettings:
         toggles: classes of the things whose colour toggling turns into its complement; walls and doors are no things.
     """
 
-    size: Length = 0.25
+    size: Metres = 0.25
     palette: tuple[str, ...] = COMMON
     floor: Height = 0.0
-    farthest: Length = 10.0
+    farthest: Metres = 10.0
     layers: PositiveInt = 2
     stride: PositiveInt = 1
     unknown: Literal["clear", "ends"] = "clear"
@@ -52,7 +52,7 @@ class GridSceneSettings:
     seed: NonNegativeInt = 0
     foresight: Distance = 5.0
     evolution: Literal["rules", "model"] = "rules"
-    carries: Length = 0.75
+    carries: Metres = 0.75
     toggles: tuple[str, ...] = ("solid", "box")
 
     def __post_init__(self) -> None:

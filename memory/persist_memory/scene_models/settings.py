@@ -9,10 +9,10 @@ from pydantic import Field
 
 from persist_cli.api.cells import COMMON, CellForm
 from persist_cli.api.scene_model import SceneForm
+from persist_memory.metres import Metres
 
 Count = Annotated[int, Field(ge=0)]
 Positive = Annotated[int, Field(ge=1)]
-Metres = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Factor = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Amount = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, lt=1)]
