@@ -46,6 +46,7 @@ lint: $(STAMP)
 	$(VENV)/bin/mypy
 	$(VENV)/bin/lint-imports
 
+# all benchmarks that run without an argument
 bench: $(STAMP)
 	for file in $$(grep -L required=True tests/benchmarks/bench_*.py); do $(VENV)/bin/python $$file || exit 1; done
 
@@ -62,5 +63,6 @@ $(STAMP): pyproject.toml constraints.txt
 	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
 	touch $(STAMP)
 
+# what these targets made and can make again; runs/ holds trainings and memories
 clean:
-	rm -rf $(VENV) runs
+	rm -rf $(VENV) docs/_build .pytest_cache .mypy_cache .ruff_cache .import_linter_cache

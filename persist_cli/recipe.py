@@ -383,6 +383,16 @@ def network_of(recipe: Recipe) -> str | None:
     return next((key for key, stages in ALONE.items() if recipe.stage in stages), None)
 
 
+def of_the_whole_model(recipe: Recipe) -> list[str]:
+    """The settings with which each process predicts by itself in training, or scores it: a sharded model cannot."""
+    given = {
+        "distill": recipe.distill is not None,
+        "adversarial": recipe.adversarial is not None,
+        "data.own_writes": recipe.data.own_writes > 0,
+    }
+    return [setting for setting, asked in given.items() if asked]
+
+
 def _of_a_network(recipe: Recipe) -> list[str]:
     """Describe what a recipe of a policy or a model of scenes lacks, or has that means nothing to it."""
     kind = network_of(recipe)

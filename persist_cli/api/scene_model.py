@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from pathlib import Path
@@ -120,6 +120,7 @@ class SceneModel(nn.Module, ABC):
 
     settings_type: ClassVar[type] = NoSettings
     stages: ClassVar[tuple[Stage, ...]] = ("scene-codec", "scene")  # and scene-outcome, if it has one
+    settled: ClassVar[Mapping[Stage, str]] = {}  # the setting that what a stage trained stands on, in later stages too
     name: str = ""  # set by the registry
 
     def __init__(self, settings: Any) -> None:

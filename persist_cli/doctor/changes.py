@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from persist_cli.doctor.machine import Machine
-from persist_cli.recipe import Recipe, network_of
+from persist_cli.recipe import Recipe, network_of, of_the_whole_model
 from persist_cli.viewing.console import watched
 
 
@@ -86,11 +86,6 @@ LORA: Final = Change("LoRA", ("lora.rank=64",), 16)
 STAGE2: Final = Strategy((Change("stage 2 only", (), 0),))  # no change but another recipe, that of the next stage
 
 
-def needs_whole(recipe: Recipe) -> bool:
-    """Whether each process predicts by itself in training, or scores what it predicts, which takes the whole model."""
-    return recipe.distill is not None or recipe.adversarial is not None or recipe.data.own_writes > 0
-
-
 def available_changes(recipe: Recipe, machine: Machine, sharded: bool) -> list[Change]:
     """The changes that can make this recipe need less on this machine and are not in force yet."""
     training, cuda = recipe.training, machine.kind == "cuda"
@@ -100,7 +95,7 @@ def available_changes(recipe: Recipe, machine: Machine, sharded: bool) -> list[C
     frozen, half = FROZEN if recipe.stage == "2" else FROZEN_UNSHARDED, training.frozen_precision == "bf16"
     distilled = recipe.distill is not None  # by averages that stay on the device, and without LoRA
     can_shard = transformer and training.optimizer == "adamw" and not (half and frozen.unsharded_only)
-    can_shard = can_shard and not needs_whole(recipe)
+    can_shard = can_shard and not of_the_whole_model(recipe)
     fsdp = Change(f"FSDP over {machine.devices}", (), 2, (SHARDED,))
     changes: list[tuple[bool, Change]] = [
         (of_a_backbone and not training.vae_slicing, SLICING),

@@ -22,7 +22,6 @@ from persist_cli.doctor.changes import (
     Change,
     Strategy,
     available_changes,
-    needs_whole,
     smallest_fitting,
 )
 from persist_cli.doctor.dry_run import dry_run, network_dry_run, network_recipe
@@ -36,7 +35,7 @@ from persist_cli.doctor.meta_model import (
     build_stage2_meta_model,
 )
 from persist_cli.errors import PersistError
-from persist_cli.recipe import Recipe, apply_overrides, make_recipe, to_plain
+from persist_cli.recipe import Recipe, apply_overrides, make_recipe, of_the_whole_model, to_plain
 from persist_cli.train.distributed import check_sharded
 from persist_cli.viewing.console import busy, print_json, print_table, say, watched
 
@@ -164,8 +163,8 @@ def run_doctor(name: str, overrides: Sequence[str], machine: Machine, sharded: b
         raise PersistError(f"{samples} samples at once on a device: no plan is made of more than {MOST_SAMPLES}")
     if sharded and isinstance(meta_model, SceneMetaModel):
         raise PersistError("--fsdp: a model of scenes is not sharded; leave it out")
-    if sharded and needs_whole(meta_model.recipe):
-        raise PersistError("--fsdp: distill, adversarial and data.own_writes need the whole model; leave it out")
+    if sharded and (whole := of_the_whole_model(meta_model.recipe)):
+        raise PersistError(f"--fsdp: {whole[0]} needs the whole model in each process; leave it out")
     if sharded and isinstance(meta_model, MetaModel):
         meta_model.backbone.trained_parameters(meta_model.recipe.stage)
         check_sharded(meta_model.recipe, meta_model.backbone)

@@ -9,7 +9,7 @@ import json
 import re
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import timedelta
 from pathlib import Path
 from typing import Any, Final
@@ -29,6 +29,7 @@ from persist_cli.api.checkpoint import (
     step_folders,
 )
 from persist_cli.api.inference import SamplingOverrides
+from persist_cli.api.meta_device import without_weights
 from persist_cli.api.policy_network import PolicyNetwork
 from persist_cli.api.scene_model import SceneModel
 from persist_cli.api.stages import SCENE_STAGES
@@ -42,7 +43,7 @@ from persist_cli.checkpoints.load import (
 )
 from persist_cli.checkpoints.placement import warn_if_slow
 from persist_cli.checkpoints.relink import weights_at
-from persist_cli.checkpoints.scene_models import check_stage, find_scene_model
+from persist_cli.checkpoints.scene_models import TrainedSceneModel, check_stage, find_scene_model
 from persist_cli.errors import PersistError, RecipeError
 from persist_cli.io.files import check_folder
 from persist_cli.memorize.factory import MemoryFactory
@@ -268,10 +269,29 @@ def prepare_scene_model(recipe: Recipe, run: Path) -> tuple[SceneModel, Training
         raise RecipeError(f"base {recipe.base} is a model of scenes {begun.plugin!r}, not {recipe.scene.name!r}")
     if begun.stage == "scene-codec" and recipe.stage == "scene-outcome":
         raise RecipeError(f"base {recipe.base} is the codec of a model of scenes alone; name a run of stage scene")
-    if not steps and SCENE_STAGES.index(begun.stage) > SCENE_STAGES.index(recipe.stage) > 0:
-        warn(f"base {recipe.base}: what stage {begun.stage} learned is not kept; train that stage again on this run")
+    if not steps:
+        check_settled(begun, model, recipe)
+        if SCENE_STAGES.index(begun.stage) > SCENE_STAGES.index(recipe.stage) > 0:
+            lost = f"what stage {begun.stage} learned is not kept; train that stage again on this run"
+            warn(f"base {recipe.base}: {lost}")
     begun.load_into(model, min(begun.stage, recipe.stage, key=SCENE_STAGES.index))
     return model, begun.training_scenes or TrainingScenes(complete=False)
+
+
+def check_settled(begun: TrainedSceneModel, model: SceneModel, recipe: Recipe) -> None:
+    """Raise ``RecipeError`` when a model has other settings than what its base learned in an earlier stage."""
+    with without_weights():
+        before = asdict(make_scene_model(begun.plugin, begun.settings).settings)
+    after = asdict(model.settings)
+    for stage in itertools.takewhile(lambda stage: stage != recipe.stage, SCENE_STAGES):
+        part = model.settled.get(stage, "")
+        for name, value in before.get(part, {}).items():
+            if value != after[part][name]:
+                key = f"scene.settings.{part}.{name}"
+                raise RecipeError(
+                    f"base {recipe.base}: its stage {stage} was trained with {key}={value}, not {after[part][name]}; "
+                    "give that, or train that stage again"
+                )
 
 
 def make_accelerator(recipe: Recipe, run: Path) -> Accelerator:

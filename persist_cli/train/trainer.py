@@ -19,7 +19,7 @@ from persist_cli.data.reference import data_folder
 from persist_cli.data.writing_noise import WritingNoise
 from persist_cli.errors import RecipeError
 from persist_cli.memorize.factory import MemoryFactory, with_memory
-from persist_cli.recipe import Recipe
+from persist_cli.recipe import Recipe, of_the_whole_model
 from persist_cli.train.clip_cache import CachedClips, CacheKeys, ClipCache, ClipEncoder
 from persist_cli.train.distillation import Distiller
 from persist_cli.train.distributed import Sharding, uses_zero
@@ -55,17 +55,15 @@ class Trainer(TrainingLoop[Backbone]):
         cache: CacheSettings | None = None,
     ) -> None:
         super().__init__(recipe, accelerator)
+        check_whole(recipe, accelerator)
         self.backbone, self.factory = backbone, factory
         opponent: Opponent | None = None
         if recipe.adversarial is not None:
-            check_whole("adversarial", accelerator)
             discriminator = backbone.train_adversarially(recipe.adversarial)
             opponent = Opponent(discriminator, recipe.adversarial.learning_rate)
         parameters, settings = backbone.trained_parameters(recipe.stage), recipe.training
         for frames in recipe.data.clip_frames:
             backbone.check_clip_frames(frames)
-        if recipe.distill is not None:
-            check_whole("distill", accelerator)
         distiller = None if recipe.distill is None else Distiller(recipe.distill, backbone, recipe)
         backbone.apply_memory_savings(recipe.stage, requested_savings(settings, accelerator.device))
         clips = self.all_clips()
@@ -76,7 +74,6 @@ class Trainer(TrainingLoop[Backbone]):
             self.dataset = CachedClips(clips, self.encoder.cache)
         self.own_writes: OwnWrites | None = None
         if recipe.data.own_writes and self.encoder is not None:
-            check_whole("data.own_writes", accelerator)
             self.own_writes = OwnWrites(self.encoder, WritingNoise.of(recipe.data))
         if recipe.base is None:
             backbone.begin_stage(recipe.stage, self.first_batches(START_BATCHES))
@@ -191,7 +188,8 @@ def augmentation_of(data: DataSettings) -> Augmentation:
     return Augmentation(data.crop, data.mirror, data.color_jitter)
 
 
-def check_whole(setting: str, accelerator: Accelerator) -> None:
-    """Raise ``RecipeError`` where a process does not have the whole model, with which it could predict by itself."""
-    if accelerator.is_fsdp2 or uses_zero(accelerator):
-        raise RecipeError(f"{setting} needs the whole model in each process; launch with --multi_gpu, or leave it out")
+def check_whole(recipe: Recipe, accelerator: Accelerator) -> None:
+    """Raise ``RecipeError`` where a process has a part of the model, and the recipe needs the whole one in each."""
+    whole = of_the_whole_model(recipe)
+    if whole and (accelerator.is_fsdp2 or uses_zero(accelerator)):
+        raise RecipeError(f"{whole[0]} needs the whole model in each process; launch with --multi_gpu, or leave it out")

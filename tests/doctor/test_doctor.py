@@ -255,7 +255,7 @@ def test_no_sharding_is_proposed_where_each_process_needs_the_whole_model(persis
     )
     assert not [strategy for strategy in strategies(doctor.changes) if doctor.launch(strategy).sharded]
     ended = persist("doctor", "tiny-stage1", *settings, "base=nowhere", "--gpus", "2", "--gpu-memory", "8", "--fsdp")
-    assert (ended.code, "need the whole model; leave it out" in ended.err) == (1, True), ended.err
+    assert (ended.code, "needs the whole model in each process; leave it out" in ended.err) == (1, True), ended.err
 
 
 def test_lora_is_not_proposed_to_an_optimizer_that_cannot_train_it():

@@ -121,7 +121,7 @@ def test_what_scenes_know_may_be_kept_in_a_cache(persist, scenes, runs, tmp_path
         ("base=runs/nothing", "runs/nothing: no model of scenes there"),
         ("scene.name=nothing", "unknown scene model 'nothing'"),
         ("scene.settings.transformer.layer=2", "did you mean 'transformer.layers'"),
-        ("scene.settings.codec.latent=6", "tensors differ"),
+        ("scene.settings.codec.latent=6", "was trained with scene.settings.codec.latent=8, not 6"),
         ("data.own_writes=0.5", "stage scene takes no data.own_writes"),
         ("training.compile=true", "stage scene takes no training.compile"),
         ("stage=policy", "stage policy needs policy"),
@@ -178,6 +178,15 @@ def test_the_third_stage_needs_a_whole_model_and_interactions(persist, acted, ru
     ended = persist(*scene_stage("houses-64-scene-outcome", folder, tmp_path / "run", base, classes))
     assert (ended.code, len(ended.err.strip().splitlines())) == (1, 1)
     assert message in ended.err
+
+
+@pytest.mark.parametrize("name", ["codec", "scene"])
+def test_a_setting_of_what_the_base_has_learned_is_refused(persist, scenes, runs, tmp_path, name):
+    words = [f"base={runs / name}", "scene.settings.codec.noise=0.2"]
+    ended = persist(*scene_stage("tiny-scene", scenes, tmp_path / "run", *words))
+    assert (ended.code, len(ended.err.strip().splitlines())) == (1, 1)
+    assert "its stage scene-codec was trained with scene.settings.codec.noise=0.1, not 0.2" in ended.err
+    assert not (tmp_path / "run").exists()
 
 
 def test_data_without_cells_are_refused(persist, walks, tmp_path):

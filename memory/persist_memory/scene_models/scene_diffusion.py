@@ -18,6 +18,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from types import MappingProxyType
 
 import torch
 import torch.nn.functional as F
@@ -79,6 +80,7 @@ class SceneDiffusion(SceneModel):
 
     settings_type = SceneDiffusionSettings
     stages = SCENE_STAGES
+    settled = MappingProxyType({"scene-codec": "codec", "scene": "transformer"})
     settings: SceneDiffusionSettings
     weights: Tensor
 
