@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from persist_cli.api.inference import SamplingOverrides
 from persist_cli.errors import CheckpointError
+from persist_cli.io.command_line import quoted
 from persist_cli.io.files import bundled_folder, read_json
 from persist_cli.io.sha256sums import check_sums
 
@@ -225,11 +226,11 @@ def find_base(folder: Path, pointer: Mapping[str, Any]) -> Path:
     if not there:
         raise CheckpointError(
             f"{run}: its base is missing; the checkpoint with fingerprint {wanted[:SHOWN]} was at {place}; "
-            f"if it moved: persist relink {run} NEW_PLACE"
+            f"if it moved: persist relink {quoted(run)} NEW_PLACE"
         )
     raise CheckpointError(
         f"{run}: was trained on another base than the one now at {place}, whose fingerprint is {there[0][:SHOWN]} "
-        f"and not {wanted[:SHOWN]}; if its own is elsewhere: persist relink {run} PLACE"
+        f"and not {wanted[:SHOWN]}; if its own is elsewhere: persist relink {quoted(run)} PLACE"
     )
 
 

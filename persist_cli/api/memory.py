@@ -16,14 +16,13 @@ from torch import Tensor
 
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.encoder import Encoder
+from persist_cli.api.memory_file import FORMAT, FORMAT_VERSION
 from persist_cli.api.observations import Observations, Origin, origins_like
 from persist_cli.api.scene_edits import Edit, EditOutcome
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import write_tensors
 from persist_cli.io.settings import NoSettings
-
-FORMAT_VERSION = 2  # 1 has neither origins nor paths
 
 PATH = "path:"  # begins the names of tensors in a memory file that hold paths
 
@@ -226,7 +225,7 @@ class Memory(ABC):
         """Return the JSON values that a memory file holds beside its tensors: kind, settings, encoder, reference."""
         figures = self.figures()
         return {
-            "format": "persist-memory",
+            "format": FORMAT,
             "version": FORMAT_VERSION,
             "memory": self.name,
             "settings": dataclasses.asdict(self.settings),

@@ -17,6 +17,7 @@ from typing import Final
 from persist_cli.api.checkpoint import STEP, Checkpoint, step_folders
 from persist_cli.checkpoints.lineage import RECIPE
 from persist_cli.errors import PersistError
+from persist_cli.io.command_line import quoted
 from persist_cli.io.files import empty_folder_aside, read_json, write_json
 from persist_cli.recipe import recipe_values
 from persist_cli.viewing.console import warn
@@ -57,7 +58,7 @@ def mark_in_use(checkpoint: Checkpoint, run: Path) -> None:
                 warn(
                     f"{path.parent}: cannot be written ({error.strerror}), so nothing says there that {run} stands on "
                     f"{step.name}; before that base is trained further, copy {step} and run: "
-                    f"persist relink {run} THE_COPY"
+                    f"persist relink {quoted(run)} THE_COPY"
                 )
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from persist_cli.api.checkpoint import REFERENCE, find_checkpoint
 from persist_cli.api.ground import GroundMap
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
+from persist_cli.api.memory_file import is_memory_file
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.environments.environment import HouseEnv, HouseVectorEnv, Scenes
 from persist_cli.environments.goals import Goals, KnownGround, PosedFrames, find_goals
@@ -66,8 +67,7 @@ class ImaginedSettings(TaskSettings):
     @property
     def memory_file(self) -> Path | None:
         """The file of the memory, ``None`` where frames are named or nothing is."""
-        path = Path(self.memory or "")
-        return path if path.suffix == ".safetensors" or path.is_file() else None
+        return None if self.memory is None or not is_memory_file(self.memory) else Path(self.memory)
 
     @property
     def given_frames(self) -> PosedFrames | None:

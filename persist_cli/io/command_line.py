@@ -1,10 +1,12 @@
-"""The command line that runs, for results that say how to measure them again."""
+"""Command lines: the one that runs, for results that say how to measure them again, and words of printed ones."""
 
 from __future__ import annotations
 
 import contextlib
+import shlex
 from collections.abc import Iterator, Sequence
 from contextvars import ContextVar
+from pathlib import Path
 from typing import Final
 
 _WORDS: Final = ContextVar[tuple[str, ...]]("_WORDS", default=())
@@ -27,3 +29,9 @@ def running_command() -> list[str]:
     """
     words = _WORDS.get()
     return ["persist", *words] if words else []
+
+
+def quoted(word: str | Path) -> str:
+    """Return a word of a command line that is printed, as a shell takes it; ``#`` within one needs no quotes."""
+    plain = str(word).replace("#", "")
+    return str(word) if shlex.quote(plain) == plain else shlex.quote(str(word))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,6 +12,7 @@ from torch import Tensor
 from persist_cli.api.memory import Memory
 from persist_cli.api.scene import Scene
 from persist_cli.errors import CheckpointError, DataError
+from persist_cli.io.command_line import quoted
 from persist_cli.io.files import check_folder, remove_leftovers
 from persist_cli.memorize.imagining import of_known_cells, with_scene_model
 from persist_cli.memorize.memory_config import MemorizePlan, resolve_memory_config, with_usual_classes
@@ -176,14 +176,8 @@ def _save_and_print(
 def walking_words(memory: Memory, out: Path, start: str, checkpoint: Path | None) -> str:
     """Return the command that walks in the memory of a picture, by default with the packaged world model."""
     model = [] if checkpoint is None else [str(checkpoint)]
-    walk = " ".join(map(_quoted, [*model, "--adapter", memory.name, "--start", start, "--memory", str(out)]))
+    walk = " ".join(map(quoted, [*model, "--adapter", memory.name, "--start", start, "--memory", str(out)]))
     return f'walk in it: persist rollout {walk} --actions "right*6"'
-
-
-def _quoted(word: str) -> str:
-    """A word as a shell takes it; ``#`` within one needs no quotes."""
-    plain = word.replace("#", "")
-    return word if shlex.quote(plain) == plain else shlex.quote(word)
 
 
 def _table_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -1,52 +1,21 @@
-"""Memory files: safetensors files whose header names the memory, its encoder and their settings."""
+"""Memory files read back into memories, with the paths that they keep."""
 
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from persist_cli.api.memory import FORMAT_VERSION, PATH, FrameOfReference, Memory
+from persist_cli.api.memory import PATH, FrameOfReference, Memory
+from persist_cli.api.memory_file import read_header
 from persist_cli.errors import CheckpointError, PersistError
 from persist_cli.io.files import read_tensors
 from persist_cli.memorize.imagining import with_scene_model
 from persist_cli.plugins import make_encoder, make_memory
-
-FORMAT = "persist-memory"
-FIELDS: dict[str, type | tuple[type, ...]] = {
-    "memory": str,
-    "settings": dict,
-    "encoder": str,
-    "encoder_settings": dict,
-    "channels": int,
-    "reference": str,
-    "world_up": list,
-    "cells": int,
-}
-
-
-def read_header(path: Path) -> dict[str, Any]:
-    """Return the header of a memory file, as ``Memory.header`` made it, without reading its tensors.
-
-    Raises:
-        CheckpointError: when the file is missing, truncated, no memory, of a newer version, or its header is damaged.
-    """
-    from safetensors import SafetensorError, safe_open
-
-    if not path.is_file():
-        raise CheckpointError(f"{path}: no such memory file; `persist memorize` writes one")
-    try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-    except (SafetensorError, ValueError, OSError) as error:
-        raise CheckpointError(f"{path}: not a whole memory file ({str(error).splitlines()[0]})") from error
-    return _checked_header(metadata, path)
 
 
 def load_memory(path: Path) -> Memory:
@@ -100,27 +69,3 @@ def add_paths(paths: dict[str, Tensor], others: Mapping[str, Tensor]) -> None:
         names = itertools.chain([name], (f"{name} ({number})" for number in itertools.count(2)))
         free = next(name for name in names if name not in paths or torch.equal(paths[name], poses))
         paths[free] = poses
-
-
-def _checked_header(metadata: dict[str, str], path: Path) -> dict[str, Any]:
-    if "persist" not in metadata:
-        raise CheckpointError(f"{path}: a safetensors file, but no memory of persist (it has no 'persist' header)")
-    try:
-        header = json.loads(metadata["persist"])
-    except ValueError as error:
-        raise CheckpointError(f"{path}: its header is damaged ({error})") from error
-    if not isinstance(header, dict) or header.get("format") != FORMAT:
-        raise CheckpointError(f"{path}: written by persist, but not as a memory file")
-    version = header.get("version")
-    if not isinstance(version, int) or version > FORMAT_VERSION:
-        raise CheckpointError(f"{path}: of version {version}; this persist reads versions up to {FORMAT_VERSION}")
-    wrong = [name for name, kind in FIELDS.items() if not isinstance(header.get(name), kind)]
-    if not wrong and not _is_direction(header["world_up"]):
-        wrong = ["world_up"]
-    if wrong:
-        raise CheckpointError(f"{path}: its header is damaged (see {', '.join(wrong)})")
-    return header
-
-
-def _is_direction(values: list[Any]) -> bool:
-    return len(values) == 3 and all(isinstance(value, int | float) for value in values) and any(values)

@@ -31,17 +31,7 @@ LOWEST: Final = 0.02  # share of the points below the floor's height, which are 
 HEIGHTS: Final = (0.3, 2.5)  # metres of a camera above the floor that can be a walker's
 NEAREST: Final = 0.1  # metres before the camera at which points begin to be drawn
 LARGEST: Final = 6  # a point is drawn as 2 to the power of 6 pixels at most
-HEADER: Final = 8  # bytes of a memory file before its header, which is JSON
 HEADINGS: Final = 12  # directions that are compared in a file without paths
-
-
-def is_memory_file(text: str) -> bool:
-    """Whether a start names a memory file: by its suffix, or a file that begins as one of safetensors does."""
-    path = Path(text)
-    if path.suffix == ".safetensors" or not path.is_file():
-        return path.suffix == ".safetensors"
-    with path.open("rb") as file:
-        return file.read(HEADER + 1)[HEADER:] == b"{"
 
 
 def memory_start(path: Path, image_size: tuple[int, int], fov: tuple[float, float] | None) -> Trajectory:

@@ -10,14 +10,13 @@ from persist_cli.api.backbone import Backbone
 from persist_cli.api.checkpoint import PLAIN, REFERENCE, Checkpoint, find_checkpoint
 from persist_cli.api.inference import CONSISTENCY, InferenceOptions, SamplingOverrides
 from persist_cli.api.memory import Memory
+from persist_cli.api.memory_file import is_memory_file, read_header
 from persist_cli.api.observations import Trajectory
 from persist_cli.checkpoints.load import adapter_memory, empty_backbone, load_adapter, load_backbone, warn_of_plain
 from persist_cli.checkpoints.placement import check_placement
 from persist_cli.data.clips import check_size
 from persist_cli.errors import CheckpointError, DataError
-from persist_cli.memorize.memory_file import read_header
 from persist_cli.memorize.sources import Source, find_sources
-from persist_cli.play.memory_start import is_memory_file
 from persist_cli.play.play import Play
 from persist_cli.play.settings import PlaySettings
 from persist_cli.play.start import StartOptions, read_start
@@ -121,18 +120,14 @@ def find_given(given: Sequence[str], checkpoint: Checkpoint, names: Sequence[str
         PersistError: when a memory file is read by none of the adapters, or frames are not there.
     """
     kinds = {adapter_memory(checkpoint, name).name for name in names if name != PLAIN}
-    for text in filter(_is_file, given):
+    for text in filter(is_memory_file, given):
         kind = read_header(Path(text))["memory"]
         if kind not in kinds:
             readers = [one for one in checkpoint.adapters if adapter_memory(checkpoint, one).name == kind]
             advice = f"add {readers[0]!r} to --memories" if readers else "no adapter of this model does"
             raise CheckpointError(f"{text}: a memory of kind {kind!r}, which {', '.join(names)} cannot read; {advice}")
-    frames = [text for text in given if not _is_file(text)]
+    frames = [text for text in given if not is_memory_file(text)]
     return find_sources(frames) if frames else []
-
-
-def _is_file(given: str) -> bool:
-    return Path(given).suffix == ".safetensors" or Path(given).is_file()
 
 
 def _memory(checkpoint: Checkpoint, name: str, options: PlayOptions, start: Trajectory) -> Memory | None:
@@ -140,7 +135,7 @@ def _memory(checkpoint: Checkpoint, name: str, options: PlayOptions, start: Traj
     if name == PLAIN:
         return None
     kind = adapter_memory(checkpoint, name).name
-    files = [Path(text) for text in options.given if _is_file(text) and read_header(Path(text))["memory"] == kind]
+    files = [Path(text) for text in options.given if is_memory_file(text) and read_header(Path(text))["memory"] == kind]
     if len(files) > 1:
         raise CheckpointError(
             f"{files[1]}: a second memory of kind {kind!r}; give one, or `persist memorize --merge` them"

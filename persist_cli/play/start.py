@@ -7,12 +7,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
+from persist_cli.api.memory_file import is_memory_file
 from persist_cli.api.observations import Trajectory
 from persist_cli.data.reference import parse_reference
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError
 from persist_cli.memorize.picture import PictureOptions, is_picture, without_picture, write_picture
-from persist_cli.play.memory_start import is_memory_file, memory_start
+from persist_cli.play.memory_start import memory_start
 from persist_cli.rollout.camera_path import RolloutPlan, walking_vocabulary
 
 SAMPLE_START = "sample#0:32"  # where a walk begins when nothing is named

@@ -11,6 +11,7 @@ from persist_cli.api.checkpoint import PLAIN, REFERENCE, Checkpoint, find_checkp
 from persist_cli.api.ground import Body
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.memory import Memory
+from persist_cli.api.memory_file import read_header
 from persist_cli.api.observations import TrajectoryInfo
 from persist_cli.api.scene import Scene
 from persist_cli.checkpoints.load import adapter_memory, empty_backbone, load_backbone
@@ -18,7 +19,7 @@ from persist_cli.data.clips import check_size
 from persist_cli.data.reference import parse_reference
 from persist_cli.errors import CheckpointError
 from persist_cli.memorize.factory import MemoryFactory
-from persist_cli.memorize.memory_file import load_memory, read_header
+from persist_cli.memorize.memory_file import load_memory
 from persist_cli.navigation.ground_mapper import body_of, tells_body
 from persist_cli.rollout.camera_path import RolloutPlan
 from persist_cli.rollout.world_model import Agent, WorldModel

@@ -45,6 +45,7 @@ from persist_cli.checkpoints.placement import warn_if_slow
 from persist_cli.checkpoints.relink import weights_at
 from persist_cli.checkpoints.scene_models import TrainedSceneModel, check_stage, find_scene_model
 from persist_cli.errors import PersistError, RecipeError
+from persist_cli.io.command_line import quoted
 from persist_cli.io.files import check_folder
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.plugins import make_scene_model
@@ -361,26 +362,28 @@ def next_command(name: str, recipe: Recipe, run: Path) -> str:
         recipe: the recipe.
         run: the run's folder.
     """
+    trained = quoted(run)
     if recipe.policy is not None:
-        return f"persist bench plan --policy {run}"
-    data = " ".join(f"--data {folder}" for folder in recipe.data.path)
+        return f"persist bench plan --policy {trained}"
+    data = " ".join(f"--data {quoted(folder)}" for folder in recipe.data.path)
     if recipe.stage == "scene-codec":
         following = name.removesuffix("-codec")
         known = following if following != name and following in recipe_names() else "RECIPE"
-        return f"persist finetune {known} {data} base={run}"
+        return f"persist finetune {known} {data} base={trained}"
     if recipe.stage == "scene-outcome":
-        return f"persist bench scene {run} --data HELD_OUT_DATA --parts evolution --out runs/bench-evolution"
+        return f"persist bench scene {trained} --data HELD_OUT_DATA --parts evolution --out runs/bench-evolution"
     if recipe.stage == "scene":
-        return f"persist bench scene {run} --data HELD_OUT_DATA --train {recipe.data.path[0]} --out runs/bench-scene"
+        houses = quoted(recipe.data.path[0])
+        return f"persist bench scene {trained} --data HELD_OUT_DATA --train {houses} --out runs/bench-scene"
     if recipe.distill is not None and recipe.stage == "1":
-        return f"persist eval {run} --data HELD_OUT_DATA --memories {PLAIN}"
+        return f"persist eval {trained} --data HELD_OUT_DATA --memories {PLAIN}"
     if recipe.memory is not None:
-        return f"persist eval {run} --data HELD_OUT_DATA --memories {PLAIN},{recipe.memory.name}"
+        return f"persist eval {trained} --data HELD_OUT_DATA --memories {PLAIN},{recipe.memory.name}"
     stage = re.fullmatch(r"(.+)-(?:codec|stage1)(.*)", name)
     following = "stage1" if recipe.stage == "codec" else "stage2-voxel"
     guesses = [f"{stage[1]}-{following}{stage[2]}", f"{stage[1]}-{following}"] if stage else []
     known = next((guess for guess in guesses if guess in recipe_names()), "RECIPE")
-    return f"persist finetune {known} {data} base={run}"
+    return f"persist finetune {known} {data} base={trained}"
 
 
 def _different_keys(before: Any, now: Any, key: str) -> list[str]:

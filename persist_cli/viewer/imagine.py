@@ -19,11 +19,11 @@ from persist_cli.api.checkpoint import PLAIN, Checkpoint, find_checkpoint, refer
 from persist_cli.api.geometry import pose_differences
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.memory import Memory
+from persist_cli.api.memory_file import read_header
 from persist_cli.checkpoints.load import adapter_memory
 from persist_cli.data.clips import interactions_of
 from persist_cli.data.store import TrajectoryFile
 from persist_cli.errors import PersistError
-from persist_cli.memorize.memory_file import read_header
 from persist_cli.rollout.camera_path import RolloutPlan
 from persist_cli.rollout.open_world import check_cells, check_memory, empty_memory, world_with
 from persist_cli.rollout.world_model import WorldModel

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from persist_cli.api.cameras import Cameras, check_poses
 from persist_cli.api.memory import Memory
+from persist_cli.api.memory_file import is_memory_file
 from persist_cli.api.observations import Observations, Origin
 from persist_cli.data.reference import Reference, parse_reference
 from persist_cli.data.store import TrajectoryFile
@@ -96,7 +97,7 @@ def open_subject(text: str, truth: str | None = None, start: str | None = None) 
     place = Path(text)
     if place.is_dir() and ((place / "rollout.json").exists() or list(place.glob("*/rollout.json"))):
         subject = _of_rollout(place)
-    elif place.suffix == ".safetensors" or place.is_file():
+    elif is_memory_file(text):
         subject = _of_memory(place)
     else:
         subject = _of_trajectory(text)

@@ -8,10 +8,11 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from persist_cli.api.memory_file import read_header
 from persist_cli.api.observations import Origin
 from persist_cli.errors import CheckpointError, PersistError
 from persist_cli.io.files import read_tensors
-from persist_cli.memorize.memory_file import load_memory, load_paths, read_header
+from persist_cli.memorize.memory_file import load_memory, load_paths
 from tests.support.room_views import MEMORIES, room_walk, same_bits, written_memory
 
 

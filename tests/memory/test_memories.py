@@ -4,7 +4,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from persist_cli.api.memory import FORMAT_VERSION, FrameOfReference
+from persist_cli.api.memory import FrameOfReference
+from persist_cli.api.memory_file import FORMAT_VERSION
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError, PersistError
 from persist_cli.plugins import make_encoder, make_memory

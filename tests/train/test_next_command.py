@@ -35,3 +35,9 @@ def test_a_scene_model_is_measured_next_with_a_data_set_of_its_training(tmp_path
     command = next_command("tiny-scene", recipe, tmp_path)
     parse_line(command.removeprefix("persist "))
     assert "--train one --out" in command
+
+
+def test_names_with_spaces_are_quoted():
+    values = {"stage": "1", "data": {"path": "my houses"}}
+    command = next_command("houses-64-stage1", make_recipe(values, "houses-64-stage1"), Path("runs/my model"))
+    assert command == "persist finetune houses-64-stage2-voxel --data 'my houses' base='runs/my model'"

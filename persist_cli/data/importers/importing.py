@@ -16,6 +16,7 @@ from persist_cli.data.images import CropResize, crop_resize, parse_size
 from persist_cli.data.store import SUFFIX, TrajectoryFile, write_trajectory
 from persist_cli.data.store_header import schema
 from persist_cli.errors import DataError, PluginError
+from persist_cli.io.command_line import quoted
 from persist_cli.io.files import remove_leftovers
 from persist_cli.plugins import find_plugin, make_importer
 from persist_cli.viewing.console import add_task, print_json, print_table, progress, say
@@ -206,7 +207,7 @@ def run_import(format: str, source: Path, out: Path, plan: ImportPlan, json: boo
         if row["causes"]:
             rest = row["left_out"] - len(row["causes"])
             say(f"left out of {row['name']}: {'; '.join(row['causes'])}{f'; and {rest} more' if rest else ''}")
-    say(f"next: persist inspect {plan.parts(out)[-1][1]}")
+    say(f"next: persist inspect {quoted(plan.parts(out)[-1][1])}")
 
 
 def import_trajectory(importer: Importer, trajectory: ForeignTrajectory, plan: ImportPlan, out: Path) -> dict[str, Any]:

@@ -232,3 +232,15 @@ def test_what_is_no_data_set_is_named_with_the_command_that_looks_at_it(
         assert kind in result.out
         assert command in result.out
     assert persist("inspect", tmp_path / "nothing").code == 1
+
+
+@pytest.mark.parametrize("name", ["m.safetensors", "memory-of-the-house"])
+def test_a_damaged_memory_file_is_named(persist, walks: Path, tmp_path: Path, name: str) -> None:
+    memory = tmp_path / "m.safetensors"
+    assert persist("memorize", f"{walks}#0:0-4", "--memory", "voxel", "--out", memory).code == 0
+    whole = memory.read_bytes()
+    damaged = tmp_path / name
+    damaged.write_bytes(whole[: len(whole) // 2])
+    result = persist("inspect", damaged)
+    assert (result.code, len(result.err.strip().splitlines())) == (1, 1)
+    assert f"{damaged}: not a whole memory file" in result.err
