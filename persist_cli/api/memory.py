@@ -20,7 +20,7 @@ from persist_cli.api.memory_file import FORMAT, FORMAT_VERSION
 from persist_cli.api.observations import Observations, Origin, origins_like
 from persist_cli.api.scene_edits import Edit, EditOutcome
 from persist_cli.api.tokens import MemoryTokens
-from persist_cli.errors import CheckpointError
+from persist_cli.errors import CheckpointError, PersistError
 from persist_cli.io.files import write_tensors
 from persist_cli.io.settings import NoSettings
 
@@ -191,10 +191,10 @@ class Memory(ABC):
             seed: of what is imagined where a thing was that is taken away.
 
         Raises:
-            CheckpointError: when a memory of this kind cannot be edited.
+            PersistError: when a memory of this kind cannot be edited.
             DataError: when an edit cannot be done; then nothing changes.
         """
-        raise CheckpointError(f"a memory of kind {self.name!r} cannot be edited; those of kind scene and voxel can")
+        raise PersistError(f"a memory of kind {self.name!r} cannot be edited; a scene or a map of cells can")
 
     def clear(self) -> None:
         """Empty the memory."""

@@ -11,13 +11,13 @@ from torch import Tensor
 
 from persist_cli.api.memory import Memory
 from persist_cli.api.scene import Scene
-from persist_cli.errors import CheckpointError, DataError
+from persist_cli.errors import CheckpointError, DataError, PersistError
 from persist_cli.io.command_line import quoted
 from persist_cli.io.files import check_folder, remove_leftovers
 from persist_cli.memorize.imagining import of_known_cells, with_scene_model
 from persist_cli.memorize.memory_config import MemorizePlan, resolve_memory_config, with_usual_classes
 from persist_cli.memorize.memory_file import add_paths, load_memory, load_paths
-from persist_cli.memorize.picture import PictureOptions, is_picture, without_picture, write_picture
+from persist_cli.memorize.picture import PictureOptions, is_picture, refuse_picture_options, write_picture
 from persist_cli.memorize.sources import Source, common_reference, find_sources
 from persist_cli.plugins import load_plugin, make_encoder, make_memory
 from persist_cli.recipe import MemoryConfig
@@ -74,7 +74,7 @@ def _with_picture(data: list[str], options: PictureOptions, out: Path) -> list[s
     """References to data; a picture is written as a data set beside the memory first."""
     pictures = [text for text in data if is_picture(text)]
     if not pictures:
-        without_picture(options)
+        refuse_picture_options(options)
         return data
     if len(data) > 1:
         raise DataError(f"{pictures[0]}: a scene of a picture is made of one picture, here are {len(data)}")
@@ -82,16 +82,16 @@ def _with_picture(data: list[str], options: PictureOptions, out: Path) -> list[s
 
 
 def check_imagines(config: MemoryConfig, plan: MemorizePlan) -> None:
-    """Raise ``CheckpointError`` where a memory is to imagine that is no scene, or a seed is given for nothing."""
+    """Raise ``PersistError`` where a memory is to imagine that is no scene, or a seed is given for nothing."""
     kind = config.name
     if issubclass(load_plugin("memory", kind), Scene):
         if plan.seed is not None and not plan.complete and config.settings.get("model") is None:
-            raise CheckpointError("--seed: this scene has no model that imagines; add --complete or --model")
+            raise PersistError("--seed: this scene has no model that imagines; add --complete or --model")
         return
     if plan.complete:
-        raise CheckpointError(f"--complete: a memory of kind {kind!r} imagines nothing; take --memory scene")
+        raise PersistError(f"--complete: a memory of kind {kind!r} imagines nothing; take --memory scene")
     if plan.seed is not None:
-        raise CheckpointError(f"--seed: a memory of kind {kind!r} imagines nothing; leave it out")
+        raise PersistError(f"--seed: a memory of kind {kind!r} imagines nothing; leave it out")
 
 
 def imagining_scene(memory: Memory) -> Scene:
@@ -114,7 +114,7 @@ def run_merge(paths: list[Path], out: Path, json: bool) -> None:
         json: whether JSON is printed instead of a table.
     """
     if len(paths) < 2:
-        raise CheckpointError("nothing to merge; name two memory files or more, as in --merge A B")
+        raise PersistError("nothing to merge; name two memory files or more, as in --merge A B")
     _check_out(out)
     merged, walked = load_memory(paths[0]), load_paths(paths[0])
     for path in watched(paths[1:], "merging", "memories"):
@@ -200,4 +200,4 @@ def _table_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
 def _check_out(out: Path) -> None:
     check_folder(out.parent)
     if out.is_dir() or out.suffix == ".png":
-        raise CheckpointError(f"{out}: name a file to write, as in memory.safetensors (its map is drawn to .png)")
+        raise PersistError(f"{out}: name a file to write, as in memory.safetensors (its map is drawn to .png)")

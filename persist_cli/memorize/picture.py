@@ -133,7 +133,7 @@ def _depth_of(picture: Path, rgb: Array, options: PictureOptions) -> Array:
     )
 
 
-def without_picture(options: PictureOptions) -> None:
+def refuse_picture_options(options: PictureOptions) -> None:
     """Raise ``DataError`` when options of pictures are given where there is none."""
     if options.given:
         named = {"--depth": options.depth, "--depth-model": options.depth_model, "--fov": options.fov}

@@ -89,15 +89,6 @@ def body_of(info: TrajectoryInfo) -> Body:
     return replace(body, height=max(body.height, body.camera_height))
 
 
-def ground_from_frames(
-    observations: Observations, world_up: Sequence[float], body: Body, spacing: float = SPACING
-) -> GroundMap:
-    """Return the map of some posed depth frames; arguments as of ``GroundMapper``."""
-    mapper = GroundMapper(world_up, body, spacing)
-    mapper.add(observations)
-    return mapper.map()
-
-
 class GroundMapper:
     """A map of the ground that grows with frames and points.
 

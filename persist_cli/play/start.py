@@ -12,7 +12,7 @@ from persist_cli.api.observations import Trajectory
 from persist_cli.data.reference import parse_reference
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError
-from persist_cli.memorize.picture import PictureOptions, is_picture, without_picture, write_picture
+from persist_cli.memorize.picture import PictureOptions, is_picture, refuse_picture_options, write_picture
 from persist_cli.play.memory_start import memory_start
 from persist_cli.rollout.camera_path import RolloutPlan, walking_vocabulary
 
@@ -62,7 +62,7 @@ def read_start(
     """
     if is_picture(options.start):
         return _picture_start(options, image_size)
-    without_picture(options.picture)
+    refuse_picture_options(options.picture)
     if is_memory_file(options.start):
         return _with_steps(memory_start(Path(options.start), image_size, fov), options)
     if Path(options.start).is_file():

@@ -7,7 +7,7 @@ from persist_cli.api.cells import CellOrigin
 from persist_cli.api.memory import Memory
 from persist_cli.api.observations import Origin
 from persist_cli.api.scene_edits import Copy, Insert, Move, Paint, Remove
-from persist_cli.errors import CheckpointError, DataError
+from persist_cli.errors import DataError, PersistError
 from tests.support.room_views import empty_memory, room_walk, written_memory
 
 BOX = {"low": (0.6, 0.0, 0.4), "high": (1.4, 0.4, 1.1)}  # of one piece of furniture
@@ -93,7 +93,7 @@ def test_an_edit_of_a_map_that_cannot_be_done_changes_nothing(room, edit, words)
 
 
 def test_a_memory_that_cannot_be_edited_says_which_can():
-    with pytest.raises(CheckpointError, match="kind 'snapshots' cannot be edited; those of kind scene and voxel can"):
+    with pytest.raises(PersistError, match="kind 'snapshots' cannot be edited; a scene or a map of cells can"):
         empty_memory("snapshots").edit([Remove(**BOX)])
 
 

@@ -12,10 +12,17 @@ from persist_cli.api.ground import Body, Cover, GroundMap
 from persist_cli.api.memory import FrameOfReference, MapPoints
 from persist_cli.api.observations import Observations, Origin
 from persist_cli.errors import DataError
-from persist_cli.navigation.ground_mapper import GroundMapper, body_of, ground_from_frames
+from persist_cli.navigation.ground_mapper import GroundMapper, body_of
 from persist_cli.plugins import make_encoder, make_memory
 from tests.support.room_worlds import BODY, ROOM, room_views
 from tests.support.rooms import UP, look
+
+
+def ground_from_frames(observations: Observations, world_up: tuple[float, float, float], body: Body) -> GroundMap:
+    """The map of some posed depth frames."""
+    mapper = GroundMapper(world_up, body)
+    mapper.add(observations)
+    return mapper.map()
 
 
 def seen(*poses: np.ndarray, origin: Origin = Origin.OBSERVED) -> Observations:
