@@ -225,7 +225,7 @@ class Table:
     @cached_property
     def own_obstacles(self) -> dict[bool, dict[str, str]]:
         """Reasons why metrics cannot be measured of these clips alone, by whether a row gives depth and by name."""
-        setups = {depth: make_setup(self.cases, depth, self.run.clip_frames) for depth in (True, False)}
+        setups = {depth: make_setup(self.cases, depth, self.run.predicted_at_once) for depth in (True, False)}
         return {depth: MetricSuite(self.run.metrics, setup).obstacles for depth, setup in setups.items()}
 
     def obstacles(self, results: RowResults) -> dict[str, str]:
@@ -258,7 +258,7 @@ class Table:
             curve = CURVE_COLUMNS[column.metric]
             windows = curve.windows(self.run.cases[0].frames)
             return curve_figure(*window_values(values, weights, windows), curve.figure, draws)
-        chosen = chosen_frames(self.cases, column.frames, self.run.clip_frames).numpy()
+        chosen = chosen_frames(self.cases, column.frames, self.run.predicted_at_once).numpy()
         by_clip, totals = window_values(np.where(chosen, values, np.nan), weights, [np.arange(values.shape[-1])])
         weighted = results.suite.is_weighted(column.metric)
         return mean_figure(by_clip[..., 0], draws, totals[..., 0] if weighted else None)

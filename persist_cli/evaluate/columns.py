@@ -84,20 +84,22 @@ def column_json(columns: Sequence[Column]) -> dict[str, dict[str, Any]]:
     return {column.name: {key: value for key, value in asdict(column).items() if key != "name"} for column in columns}
 
 
-def chosen_frames(cases: Sequence[Case], frames: FrameSelection, clip_frames: int = 0) -> Bool[Tensor, "clip frame"]:
+def chosen_frames(
+    cases: Sequence[Case], frames: FrameSelection, predicted_at_once: int = 0
+) -> Bool[Tensor, "clip frame"]:
     """A mask of the frames of each clip that a column is the mean over; the given first one never is.
 
     Args:
         cases: the clips.
         frames: which frames the column takes.
-        clip_frames: frames that are predicted at once; returns count only over more of them.
+        predicted_at_once: frames that are predicted at once; returns count only over more of them.
     """
     chosen = torch.ones(len(cases), cases[0].frames, dtype=torch.bool)
     if frames == "last":
         chosen[:, :-1] = False
     if frames == "return":
         visits = torch.tensor([case.first_visits for case in cases])
-        chosen = (visits >= 0) & (torch.arange(visits.shape[1]) - visits > clip_frames)
+        chosen = (visits >= 0) & (torch.arange(visits.shape[1]) - visits > predicted_at_once)
     if frames in ("new", "seen"):
         known = [[math.nan if share is None else share for share in case.seen_before] for case in cases]
         shares = torch.tensor(known)  # NaN is neither

@@ -135,7 +135,7 @@ def windows_json(run: Evaluation) -> dict[str, list[tuple[int, int]]]:
         return {}
     frames = run.cases[0].frames
     bounds = {metric: window_bounds(frames) for metric in SHOWN if metric in run.metrics}
-    return bounds | {CELLS: window_bounds(frames, run.clip_frames)}
+    return bounds | {CELLS: window_bounds(frames, run.predicted_at_once)}
 
 
 def splits_of(cases: Sequence[Case], folder: str) -> dict[str, str]:

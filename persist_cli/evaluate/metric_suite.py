@@ -35,11 +35,10 @@ def choose_metrics(names: Sequence[str], known: Mapping[str, Metric]) -> dict[st
     return {name: known[name] for name in known if name in wanted}
 
 
-def make_setup(cases: Sequence[Case], generated_depth: bool = True, clip_frames: int = 0) -> Setup:
+def make_setup(cases: Sequence[Case], generated_depth: bool = True, predicted_at_once: int = 0) -> Setup:
     """Describe what the cases, and a row that gives depth or does not, let a metric measure.
 
-    The frames that are counted are those predicted, without the given first one of each clip; ``clip_frames`` of them
-    are predicted at once.
+    The frames that are counted are those predicted, without the given first one of each clip.
     """
     info = cases[0].file.info
     return Setup(
@@ -49,16 +48,16 @@ def make_setup(cases: Sequence[Case], generated_depth: bool = True, clip_frames:
         width=info.width,
         depth=any(share is not None for case in cases for share in case.seen_before),
         generated_depth=generated_depth,
-        returns=any(True for case in cases for _ in far_returns(case, clip_frames)),
+        returns=any(True for case in cases for _ in far_returns(case, predicted_at_once)),
         unseen_scenes=len({case.scene for case in cases if any(unseen_frames(case))}),
-        clip_frames=clip_frames,
+        predicted_at_once=predicted_at_once,
     )
 
 
-def far_returns(case: Case, clip_frames: int) -> list[int]:
+def far_returns(case: Case, predicted_at_once: int) -> list[int]:
     """Numbers of a case's frames that return to an earlier pose over more than one predicted clip."""
     visits = enumerate(case.first_visits)
-    return [frame for frame, first in visits if first >= 0 and frame - first > clip_frames]
+    return [frame for frame, first in visits if first >= 0 and frame - first > predicted_at_once]
 
 
 def unseen_frames(case: Case) -> list[bool]:
@@ -130,7 +129,7 @@ class MetricSuite:
 
     def prediction(self, rgb: Tensor, depth: Tensor, clip: CaseFrames, where: str) -> Prediction:
         """A clip's video beside the truth, after a check that the two match."""
-        prediction = Prediction(rgb, depth, clip.observations, clip.first_visits, self.setup.clip_frames)
+        prediction = Prediction(rgb, depth, clip.observations, clip.first_visits, self.setup.predicted_at_once)
         prediction.check(f"{where}, {clip.case.data}#{clip.case.trajectory}:{clip.case.start}")
         return prediction
 

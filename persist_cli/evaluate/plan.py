@@ -112,9 +112,9 @@ class Evaluation:
         return self.suites[0].metrics
 
     @property
-    def clip_frames(self) -> int:
+    def predicted_at_once(self) -> int:
         """Number of frames that the models predict at once."""
-        return self.suites[0].setup.clip_frames
+        return self.suites[0].setup.predicted_at_once
 
     @property
     def batches(self) -> int:
@@ -183,8 +183,7 @@ def prepare(
         warn_of_clips(cases, checkpoints, search)
     for row in [*rows, *(row for row, _ in controls.missing)]:
         row.has_depth = not (row.uses_model and row.base.fingerprint in bases.depthless)
-    clip_frames = bases.frames_per_clip - 1
-    suites = [MetricSuite(metrics, make_setup(cases, row.has_depth, clip_frames)) for row in rows]
+    suites = [MetricSuite(metrics, make_setup(cases, row.has_depth, search.predicted_at_once)) for row in rows]
     return Evaluation(plan, sampling, checkpoints, protocol, cases, rows, controls.missing, suites, journal), loader
 
 

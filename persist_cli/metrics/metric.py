@@ -23,21 +23,21 @@ class Prediction:
         depth: generated depth in metres, 0 where it is missing.
         truth: true frames, with the cameras of both videos.
         first_visits: for each frame the number of the earlier frame that it returns to, -1 for none.
-        clip_frames: frames that the model predicts at once. To be like a frame not more than so many before needs no
-            memory, so such returns are left out of figures of returns.
+        predicted_at_once: frames that the model predicts at once. To be like a frame not more than so many before needs
+            no memory, so such returns are left out of figures of returns.
     """
 
     rgb: UInt8[Tensor, "frame height width 3"]
     depth: Float[Tensor, "frame height width"]
     truth: Observations
     first_visits: Int64[Tensor, " frame"]
-    clip_frames: int = 0
+    predicted_at_once: int = 0
 
     @property
     def returns(self) -> list[tuple[int, int]]:
         """Each frame that returns over more than one predicted clip, with the frame of its first visit."""
         visits = enumerate(self.first_visits.tolist())
-        return [(frame, first) for frame, first in visits if first >= 0 and frame - first > self.clip_frames]
+        return [(frame, first) for frame, first in visits if first >= 0 and frame - first > self.predicted_at_once]
 
     def check(self, where: str) -> None:
         """Raise ``DataError`` naming ``where`` when the generated frames do not match the true ones."""
@@ -68,7 +68,7 @@ class Setup:
         generated_depth: whether the model or control gives depth.
         returns: whether clips return to poses they had before, over more than one predicted clip.
         unseen_scenes: number of scenes with frames of whose view most was never seen before.
-        clip_frames: frames that the model predicts at once, see ``Prediction``.
+        predicted_at_once: frames that the model predicts at once, see ``Prediction``.
     """
 
     clips: int
@@ -79,7 +79,7 @@ class Setup:
     generated_depth: bool
     returns: bool
     unseen_scenes: int = 0
-    clip_frames: int = 0
+    predicted_at_once: int = 0
 
 
 class Metric(ABC):

@@ -58,4 +58,4 @@ def test_choosing_scene_consistency_chooses_its_guard_too():
 
 def test_returns_within_one_predicted_clip_are_no_returns():
     cases = [case((0.0, 0.1, 0.89, 0.9), (-1, -1, 0, 0))]
-    assert chosen_frames(cases, "return", clip_frames=2)[0].tolist() == [False, False, False, True]
+    assert chosen_frames(cases, "return", predicted_at_once=2)[0].tolist() == [False, False, False, True]

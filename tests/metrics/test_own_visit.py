@@ -66,7 +66,7 @@ def test_a_return_that_sees_little_or_nothing_of_its_first_visit_has_no_figure()
 
 
 def test_returns_within_one_predicted_clip_do_not_count():
-    clip = replace(there_and_back(), clip_frames=4)
+    clip = replace(there_and_back(), predicted_at_once=4)
     assert PSNR.measure(clip).isfinite().tolist() == [False] * 6 + [True]
     assert "over more than one predicted clip" in str(PSNR.obstacle(setup(returns=False)))
     assert "no depth" in str(PSNR.obstacle(setup(depth=False)))

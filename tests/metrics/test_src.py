@@ -61,7 +61,7 @@ def test_patches_that_change_places_are_seen_patch_by_patch_and_not_in_their_mea
 
 def test_a_return_within_one_predicted_clip_asks_for_no_memory_and_does_not_count(encoder):
     for metric in (SRC, PATCH, AWAY):
-        figures = metric.measure(replace(there_and_back(), clip_frames=4))
+        figures = metric.measure(replace(there_and_back(), predicted_at_once=4))
         assert figures.isfinite().tolist() == [False] * 6 + [True]
 
 
