@@ -91,12 +91,13 @@ def test_ranks_differ_where_any_feature_the_colour_or_the_place_in_the_frame_doe
     features = torch.ones(1000, 32)
     features[:, 31] = torch.arange(1000)
     colors, plain = torch.zeros(1000, 3, dtype=torch.uint8), torch.ones(1000, 32)
-    assert len(ranks(features, colors).unique()) == 1000
+    here = torch.zeros(1000, 1, dtype=torch.int64)
+    assert len(ranks(features, colors, here).unique()) == 1000
     colors[:, 2] = torch.arange(1000) % 250
-    assert len(ranks(plain, colors).unique()) == 250
+    assert len(ranks(plain, colors, here).unique()) == 250
     assert len(ranks(plain, colors, torch.arange(1000)[:, None]).unique()) == 1000
     swapped = torch.tensor([[1.0, 2.0], [2.0, 1.0]])
-    assert len(ranks(swapped, colors[:2]).unique()) == 2
+    assert len(ranks(swapped, colors[:2], here[:2]).unique()) == 2
 
 
 def test_a_sample_of_a_plain_wall_is_spread_over_it():
@@ -105,15 +106,6 @@ def test_a_sample_of_a_plain_wall_is_spread_over_it():
     pixels, _ = project(cloud(wall, stride=2).read(wall.cameras, 100).positions[None], wall.cameras)
     quarters = (pixels[0, :, 0] >= 32).long() + 2 * (pixels[0, :, 1] >= 24).long()
     assert torch.bincount(quarters, minlength=4).min() >= 12
-
-
-def test_a_file_without_ranks_is_ranked_by_features_and_colours():
-    frames = room_walk(2)
-    memory, restored = cloud(frames), cloud()
-    restored.restore({name: tensor for name, tensor in memory.tensors().items() if name != "ranks"})
-    stored = restored.tensors()
-    assert torch.equal(stored["positions"], memory.tensors()["positions"])
-    assert torch.equal(stored["ranks"], ranks(stored["features"], stored["colors"]))
 
 
 def test_imagined_points_change_no_observed_one_and_give_way_to_observations_near_them():

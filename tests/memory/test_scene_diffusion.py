@@ -13,7 +13,6 @@ from persist_cli.api.meta_device import without_weights
 from persist_cli.api.scene_model import Given, SceneSamples
 from persist_cli.api.stages import SCENE_STAGES
 from persist_cli.errors import CheckpointError, RecipeError
-from persist_cli.io.files import read_tensors, write_tensors
 from persist_cli.io.settings import parse_settings
 from persist_cli.plugins import make_scene_model
 from persist_memory.scene_models.codec import channels_first, fold, unfold, unfolded_cells
@@ -273,18 +272,6 @@ def test_how_small_things_are_is_measured_with_the_codec_and_kept_in_its_file(sa
     model.save(tmp_path, "scene-codec")
     others.load(tmp_path, "scene-codec")
     assert others.codec.least_cells.equal(model.codec.least_cells)
-
-
-def test_a_codec_of_an_earlier_version_takes_nothing_for_a_speck(tmp_path):
-    model = micro_model()
-    model.codec.least_cells.fill_(5)
-    model.save(tmp_path, "scene-codec")
-    path = tmp_path / "codec.safetensors"
-    tensors = read_tensors(path)[0]
-    del tensors["codec.least_cells"]
-    write_tensors(path, tensors)
-    model.load(tmp_path, "scene-codec")
-    assert (model.codec.least_cells == 1).all()
 
 
 def test_true_cells_are_not_read_when_sampling(model, samples):

@@ -107,8 +107,6 @@ class PointCloud(Memory):
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Replace all points by those of ``tensors``, which ``tensors()`` gave.
 
-        Files of earlier versions have no ranks; those of their points are hashes of features and colours alone.
-
         Raises:
             CheckpointError: when they are not tensors of this memory; then the cloud stays as it was.
         """
@@ -120,11 +118,10 @@ class PointCloud(Memory):
                 "features": (torch.float32, (None, width)),
                 "colors": (torch.uint8, (None, 3)),
                 ORIGINS: (torch.uint8, (None,)),
+                RANKS: (torch.int64, (None,)),
             }
-            expected |= {RANKS: (torch.int64, (None,))} if RANKS in tensors else {}
             check_tensors(tensors, expected, where)
             check_origins(tensors, where)
-            tensors = {RANKS: ranks(tensors["features"], tensors["colors"])} | tensors
         self._stored = {}
         self._absorb(tensors)
 
@@ -198,7 +195,7 @@ def distinct_order(rows: Float[Tensor, "row number"]) -> Int64[Tensor, " distinc
 def ranks(
     features: Float[Tensor, "point channel"],
     colors: UInt8[Tensor, "point 3"],
-    seen_at: Int64[Tensor, "point number"] | None = None,
+    seen_at: Int64[Tensor, "point number"],
 ) -> Int64[Tensor, " point"]:
     """A hash of each point, which no move of the world and no order of writing changes.
 
@@ -207,8 +204,7 @@ def ranks(
         colors: their colours.
         seen_at: pixel and depth of each in the frame that it was seen in, which tell points of one plain wall apart.
     """
-    parts = [float_bits(features), colors.long()] + ([] if seen_at is None else [seen_at])
-    numbers = torch.cat(parts, dim=1)
+    numbers = torch.cat([float_bits(features), colors.long(), seen_at], dim=1)
     factors = numbers.new_full((numbers.shape[1],), MIXERS[0]).cumprod(0)  # odd, too: powers that wrap around
     mixed = (numbers * factors).sum(dim=1)
     return (mixed ^ (mixed >> 29)) * MIXERS[1]

@@ -327,10 +327,7 @@ class SceneDiffusion(SceneModel):
         """Load the parts of the stages up to this one."""
         for trained in stages_to(stage):
             path = folder / FILES[trained]
-            tensors = read_tensors(path)[0]
-            if trained == "scene-codec":  # those of earlier versions say nothing of specks, and keep them
-                tensors.setdefault("codec.least_cells", torch.ones(len(self.settings.palette)))
-            load_exactly(self, tensors, set(self._tensors_of(trained)), path)
+            load_exactly(self, read_tensors(path)[0], set(self._tensors_of(trained)), path)
         self.knows_outcomes = stage == "scene-outcome"
         if self.weights.is_meta:
             self.weights = type(self)(self.settings).weights
