@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,6 +24,21 @@ RECIPES: Final = "recipes"  # the folder with those of the stages before
 ADAPTERS: Final = "adapters"  # the folder of an export's adapters, and in its folder of recipes that of theirs
 
 MEMORY_FILE: Final = "memory.json"  # the memory that an adapter reads, in its folder
+
+
+@dataclass(frozen=True)
+class Lineage:
+    """Where a trained model comes from, which is written beside its weights.
+
+    Args:
+        scenes: all that it was trained on, and what it stands on.
+        base: the checkpoint that its run starts from.
+        recipes: texts of the recipes of the stages before, by file name.
+    """
+
+    scenes: TrainingScenes
+    base: Checkpoint | None = None
+    recipes: Mapping[str, str] = field(default_factory=dict)
 
 
 def stage_recipes(folder: Path) -> dict[str, str]:
@@ -70,7 +85,7 @@ def chosen_on(checkpoint: Checkpoint) -> str | None:
     return "; ".join(f"{name}: {value}" for name, value in known.items()) if len(words) > 1 else next(iter(words), None)
 
 
-def save_stage_recipes(folder: Path, recipes: dict[str, str]) -> None:
+def save_stage_recipes(folder: Path, recipes: Mapping[str, str]) -> None:
     """Write the texts of recipes into a checkpoint's folder, by their paths in its folder ``recipes``."""
     for name, text in recipes.items():
         write_text(folder / RECIPES / name, text)

@@ -69,7 +69,7 @@ from persist_cli.train.distributed import (
     zero_plugin,
 )
 from persist_cli.train.policy_trainer import PolicyTrainer
-from persist_cli.train.run_folder import AnyTrainer, RunFolder
+from persist_cli.train.run_folder import RunFolder
 from persist_cli.train.scene_trainer import SceneTrainer
 from persist_cli.train.sources import (
     check_scene_model,
@@ -83,7 +83,7 @@ from persist_cli.train.sources import (
 from persist_cli.train.state import load_state
 from persist_cli.train.tensor_cache import CacheSettings
 from persist_cli.train.trainer import Trainer
-from persist_cli.train.training_loop import StopSignal
+from persist_cli.train.training_loop import StopSignal, TrainingLoop
 from persist_cli.viewing.console import busy, say, warn
 
 LONGEST_WAIT: Final = timedelta(hours=1)  # for a process that does not answer, as while it writes a large model
@@ -204,7 +204,7 @@ def finetune(recipe: Recipe, run: Path, stop: StopSignal, plan: FinetunePlan) ->
 
 def prepare_trainer(
     recipe: Recipe, run: Path, base: Checkpoint | None, accelerator: Accelerator, plan: FinetunePlan
-) -> AnyTrainer:
+) -> TrainingLoop[Any]:
     """The trainer of a recipe, which begins at its base or with fresh weights."""
     if recipe.policy is not None:
         return PolicyTrainer(recipe, *prepare_policy(recipe, run, plan), accelerator)
@@ -219,7 +219,7 @@ def prepare_trainer(
     return Trainer(recipe, backbone, factory, accelerator, plan.cache)
 
 
-def prepare_run(trainer: AnyTrainer, run: Path, base: Checkpoint | None, plan: FinetunePlan) -> RunFolder:
+def prepare_run(trainer: TrainingLoop[Any], run: Path, base: Checkpoint | None, plan: FinetunePlan) -> RunFolder:
     """The run's folder, with its trainer in the state of the folder's newest checkpoint where there is one."""
     trainer.times.enabled = plan.profile
     load_state(run, trainer.state)

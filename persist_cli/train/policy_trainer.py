@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from accelerate import Accelerator
 
 from persist_cli.api.checkpoint import TrainingScenes
 from persist_cli.api.policy_network import PolicyNetwork, PolicySamples
+from persist_cli.checkpoints.lineage import Lineage
 from persist_cli.data.held_out import trained_scene
 from persist_cli.data.policy_samples import PolicySampleDataset
 from persist_cli.data.reference import data_folder
+from persist_cli.policies.trained import save_policy
 from persist_cli.recipe import Recipe
 from persist_cli.train.distributed import refuse_sharding
 from persist_cli.train.training_loop import TrainingLoop
@@ -47,6 +50,11 @@ class PolicyTrainer(TrainingLoop[PolicyNetwork]):
             PersistError: when the launcher asks for sharding.
         """
         refuse_sharding(self.accelerator, "a policy's network is small and")
+
+    def write_model(self, model: PolicyNetwork, folder: Path, home: Path, lineage: Lineage) -> None:
+        """Write the network and its card."""
+        assert self.recipe.policy is not None
+        save_policy(model, self.recipe.policy.name, folder, lineage.scenes)
 
     def to_batch(self, samples: list[Any]) -> PolicySamples:
         """Make a batch of samples on the device."""

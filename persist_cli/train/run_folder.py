@@ -2,37 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
-from typing import Final
+from typing import Any
 
 from safetensors import SafetensorError
 
-from persist_cli.api.backbone import Backbone
 from persist_cli.api.checkpoint import Checkpoint, TrainingScenes, step_folders
-from persist_cli.api.policy_network import PolicyNetwork
-from persist_cli.api.scene_model import SceneModel
-from persist_cli.checkpoints.lineage import RECIPE, save_stage_recipes, stage_recipes, training_scenes
+from persist_cli.checkpoints.lineage import RECIPE, Lineage, stage_recipes, training_scenes
 from persist_cli.checkpoints.retention import KeptCheckpoint, ended_recipe, kept_checkpoints, remove_superseded
-from persist_cli.checkpoints.save import save_adapter, save_base, save_lora
-from persist_cli.checkpoints.scene_models import save_scene_model
 from persist_cli.errors import PersistError
 from persist_cli.io.files import remove_leftovers, write_text
 from persist_cli.io.sha256sums import rewrite_files
-from persist_cli.policies.trained import save_policy
 from persist_cli.recipe import Recipe, to_yaml
 from persist_cli.train.log import SpeedLog, StepLog
-from persist_cli.train.policy_trainer import PolicyTrainer
-from persist_cli.train.scene_trainer import SceneTrainer
 from persist_cli.train.sources import named_model, with_own_adapter, write_hashes
 from persist_cli.train.state import save_state
-from persist_cli.train.trainer import Trainer
-
-CODEC_BATCHES: Final = 4  # for measuring the scale of the codec's latents at the end of its stage
-SCENE_WINDOWS: Final = 64  # for measuring that of a model of scenes
-
-
-AnyTrainer = Trainer | PolicyTrainer | SceneTrainer
+from persist_cli.train.training_loop import TrainingLoop
 
 
 def source_scenes(recipe: Recipe) -> TrainingScenes:
@@ -42,6 +27,12 @@ def source_scenes(recipe: Recipe) -> TrainingScenes:
     for text in filter(None, (recipe.adapter_from, teacher)):
         scenes |= training_scenes(named_model(text, recipe.stage)[0])
     return scenes
+
+
+def lineage_of(trainer: TrainingLoop[Any], recipe: Recipe, base: Checkpoint) -> Lineage:
+    """Where the model comes from that a trainer trains on a base; the recipe names the adapter that it goes on with."""
+    scenes = trainer.scenes | training_scenes(base) | source_scenes(recipe)
+    return Lineage(scenes, base, stage_recipes(base.base_folder) if recipe.memory is None else {})
 
 
 class RunFolder:
@@ -54,16 +45,14 @@ class RunFolder:
             the runs behind it may be removed later.
     """
 
-    def __init__(self, path: Path, trainer: AnyTrainer, base: Checkpoint | None) -> None:
-        self.path, self.trainer, self.base = path, trainer, base
-        self.saved = trainer.state.step
-        self.scenes, self.recipes = trainer.scenes, dict[str, str]()
+    def __init__(self, path: Path, trainer: TrainingLoop[Any], base: Checkpoint | None) -> None:
+        self.path, self.trainer, self.saved = path, trainer, trainer.state.step
+        self.lineage = Lineage(trainer.scenes, base)
         self.log: StepLog | None = None  # the main process's alone, as no two may rewrite it
         if trainer.accelerator.is_main_process:
             remove_leftovers(path)
             if base is not None:
-                self.scenes |= training_scenes(base) | source_scenes(with_own_adapter(trainer.recipe, path))
-                self.recipes = stage_recipes(base.base_folder) if trainer.recipe.memory is None else {}
+                self.lineage = lineage_of(trainer, with_own_adapter(trainer.recipe, path), base)
             path.mkdir(parents=True, exist_ok=True)
             write_text(path / RECIPE, to_yaml(trainer.recipe))
             write_hashes(trainer.recipe, path)
@@ -113,44 +102,9 @@ class RunFolder:
         log.draw(self.path / "loss.png")
 
     def _save_model(self, folder: Path, home: Path) -> None:
-        trainer, main = self.trainer, self.trainer.accelerator.is_main_process
-        if isinstance(trainer, PolicyTrainer):
-            with trainer.model_to_save() as network:
-                if main:
-                    self._write_policy(network, folder)
-            return
-        if isinstance(trainer, SceneTrainer):
-            with trainer.model_to_save() as model:
-                if main:
-                    self._write_scene_model(trainer, model, folder)
-            return
-        with trainer.model_to_save() as backbone:
-            if main:
-                self._write_model(trainer, backbone, folder, home)
-
-    def _write_policy(self, network: PolicyNetwork, folder: Path) -> None:
-        recipe = self.trainer.recipe
-        folder.mkdir()
-        write_text(folder / RECIPE, to_yaml(recipe))
-        save_policy(network, recipe.policy.name if recipe.policy else "", folder, self.scenes)
-
-    def _write_scene_model(self, trainer: SceneTrainer, model: SceneModel, folder: Path) -> None:
-        recipe = trainer.recipe
-        folder.mkdir()
-        batches = trainer.first_batches(math.ceil(SCENE_WINDOWS / recipe.training.batch))
-        model.finish_stage(recipe.stage, batches)
-        write_text(folder / RECIPE, to_yaml(recipe))
-        save_scene_model(model, recipe.stage, folder, self.scenes)
-
-    def _write_model(self, trainer: Trainer, backbone: Backbone, folder: Path, home: Path) -> None:
-        recipe = trainer.recipe
-        folder.mkdir()
-        backbone.finish_stage(recipe.stage, trainer.first_batches(CODEC_BATCHES))
-        write_text(folder / RECIPE, to_yaml(recipe))
-        save_stage_recipes(folder, self.recipes)
-        if recipe.memory is not None and self.base is not None:
-            save_adapter(backbone, self.base, recipe.memory, folder, home, self.scenes)
-        elif recipe.lora is not None:
-            save_lora(backbone, self.base, folder, home, self.scenes)
-        else:
-            save_base(backbone, folder, self.scenes, self.base, home)
+        trainer = self.trainer
+        with trainer.model_to_save() as model:
+            if trainer.accelerator.is_main_process:
+                folder.mkdir()
+                write_text(folder / RECIPE, to_yaml(trainer.recipe))
+                trainer.write_model(model, folder, home, self.lineage)

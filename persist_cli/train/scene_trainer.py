@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+from pathlib import Path
 from typing import Any, Final
 
 from accelerate import Accelerator
 
 from persist_cli.api.checkpoint import TrainingScenes
 from persist_cli.api.scene_model import SceneModel, SceneSamples
+from persist_cli.checkpoints.lineage import Lineage
+from persist_cli.checkpoints.scene_models import save_scene_model
 from persist_cli.data.held_out import trained_scene
 from persist_cli.data.reference import data_folder
 from persist_cli.data.scene_samples import SampleShares, SceneSampleDataset
@@ -20,6 +24,8 @@ from persist_cli.train.training_loop import TrainingLoop
 WHOLE_CELLS: Final = SampleShares(frame=1, walk=0, grown=0, interaction=0)
 
 ACTING: Final = SampleShares(frame=0, walk=0, grown=0, interaction=1)  # what becomes of cells by interactions
+
+WINDOWS: Final = 64  # of which the scale of the latents is measured at the end of the codec's stage
 
 SHARES: Final = {"scene-codec": WHOLE_CELLS, "scene-outcome": ACTING}  # of the stages that see some kinds alone
 
@@ -63,6 +69,12 @@ class SceneTrainer(TrainingLoop[SceneModel]):
             PersistError: when the launcher asks for sharding.
         """
         refuse_sharding(self.accelerator, "a model of scenes is")
+
+    def write_model(self, model: SceneModel, folder: Path, home: Path, lineage: Lineage) -> None:
+        """Measure what the stage ends with, and write the parts that are trained so far and a card."""
+        batches = self.first_batches(math.ceil(WINDOWS / self.recipe.training.batch))
+        model.finish_stage(self.recipe.stage, batches)
+        save_scene_model(model, self.recipe.stage, folder, lineage.scenes)
 
     def to_batch(self, samples: list[Any]) -> SceneSamples:
         """Make a batch of samples on the device."""

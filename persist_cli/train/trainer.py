@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import Any, Final
 
 import torch
@@ -10,6 +11,8 @@ from accelerate import Accelerator
 
 from persist_cli.api.backbone import Backbone, Clips
 from persist_cli.api.checkpoint import TrainingScenes
+from persist_cli.checkpoints.lineage import Lineage, save_stage_recipes
+from persist_cli.checkpoints.save import save_adapter, save_base, save_lora
 from persist_cli.data.augment import Augmentation
 from persist_cli.data.cameras import vertical_view
 from persist_cli.data.clips import ClipDataset, ClipPlan, clip_length
@@ -30,6 +33,7 @@ from persist_cli.train.training_loop import TrainingLoop
 from persist_cli.training_settings import DataSettings
 
 START_BATCHES: Final = 16  # from which fresh weights are set at the beginning of a stage
+LAST_BATCHES: Final = 4  # from which the scale of the codec's latents is measured at the end of its stage
 
 
 class Trainer(TrainingLoop[Backbone]):
@@ -84,6 +88,18 @@ class Trainer(TrainingLoop[Backbone]):
     def make_sharding(self) -> Sharding | None:
         """What prepares the backbone for FSDP2, ``None`` where nothing is sharded."""
         return Sharding(self.backbone, self.recipe, self.accelerator) if self.accelerator.is_fsdp2 else None
+
+    def write_model(self, model: Backbone, folder: Path, home: Path, lineage: Lineage) -> None:
+        """Write an adapter or LoRA beside a pointer to what it stands on, else the whole model."""
+        recipe = self.recipe
+        model.finish_stage(recipe.stage, self.first_batches(LAST_BATCHES))
+        save_stage_recipes(folder, lineage.recipes)
+        if recipe.memory is not None and lineage.base is not None:
+            save_adapter(model, lineage.base, recipe.memory, folder, home, lineage.scenes)
+        elif recipe.lora is not None:
+            save_lora(model, lineage.base, folder, home, lineage.scenes)
+        else:
+            save_base(model, folder, lineage.scenes, lineage.base, home)
 
     def figures(self) -> dict[str, Any]:
         """What the cache did."""

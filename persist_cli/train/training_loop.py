@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import FrameType
 from typing import Any, Generic, TypeVar, cast
 
@@ -18,6 +19,7 @@ from torch import nn
 from torch.utils.data import DataLoader, Dataset
 
 from persist_cli.api.checkpoint import TrainingScenes
+from persist_cli.checkpoints.lineage import Lineage
 from persist_cli.data.clips import DistributedBatches
 from persist_cli.errors import PersistError
 from persist_cli.recipe import Recipe
@@ -128,6 +130,17 @@ class TrainingLoop(ABC, Generic[Model]):
     @abstractmethod
     def to_batch(self, samples: list[Any]) -> Any:
         """Make a batch of samples of ``dataset`` on the device."""
+
+    @abstractmethod
+    def write_model(self, model: Model, folder: Path, home: Path, lineage: Lineage) -> None:
+        """Write the trained model into a folder, in the main process alone.
+
+        Args:
+            model: the model that ``model_to_save`` yields.
+            folder: the folder, which is empty and becomes ``home`` when all is written.
+            home: where it will be.
+            lineage: where it comes from, which is written beside its weights.
+        """
 
     def figures(self) -> dict[str, Any]:
         """Figures for ``speed.jsonl`` beside the speed."""
