@@ -10,6 +10,7 @@ import contextlib
 import dataclasses
 import importlib
 import inspect
+import json
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -53,6 +54,9 @@ KINDS: Final = {
 }
 
 OWN: Final = ("persist_cli", "persist_backbones", "persist_memory")  # packages whose errors are bugs of ours
+
+
+_NAMES: Final[dict[type, str]] = {}  # those of the classes that are loaded
 
 
 @dataclass(frozen=True)
@@ -140,10 +144,13 @@ def import_plugin(plugin: Plugin) -> type[Any]:
     base = _resolve(KINDS[plugin.kind].base)
     try:
         loaded = _resolve(plugin.target)
-    except Exception as error:  # the module of another package may raise anything
+    except (Exception, SystemExit) as error:  # the module of another package may raise anything
         raise plugin.error(f"is broken: {first_line(error)}", first_line(error)) from error
     cause = _flaw(loaded, base, KINDS[plugin.kind])
     if cause:
+        raise plugin.error(f"is broken: {cause}", cause)
+    if _NAMES.setdefault(loaded, plugin.name) != plugin.name:
+        cause = f"its class is that of {_NAMES[loaded]!r} too; each name needs one of its own"
         raise plugin.error(f"is broken: {cause}", cause)
     loaded.name = plugin.name
     return loaded  # type: ignore[no-any-return]
@@ -178,14 +185,14 @@ def plugin_errors() -> Iterator[None]:
         yield
     except PersistError:
         raise
-    except Exception as error:  # a plugin may raise anything
+    except (Exception, SystemExit) as error:  # a plugin may raise anything
         blamed = _blame(error)
         if blamed is None:
             raise
         raise blamed from error
 
 
-def _blame(error: Exception) -> PluginError | None:
+def _blame(error: BaseException) -> PluginError | None:
     """The error of the plugin that an exception passed through, ``None`` when it passed through none."""
     plugins = {plugin.module: plugin for kind in KINDS for plugin in list_plugins(kind) if plugin.module not in OWN}
     inside = [(frame, line) for frame, line in _frames(error.__traceback__) if _package_of(frame) in plugins]
@@ -197,7 +204,10 @@ def _blame(error: Exception) -> PluginError | None:
     named = [plugin for plugin in of_package if method.startswith(f"{plugin.target.partition(':')[2]}.")]
     plugin = (named or of_package)[0]
     cause = f"{first_line(error)} ({innermost.f_code.co_filename}:{line})"
-    return plugin.error(f"failed in {method}: {cause}; set {TRACEBACK}=1 for the whole traceback", cause)
+    failed = f"failed in {method}: {cause}; set {TRACEBACK}=1 for the whole traceback"
+    if named or len(of_package) == 1:
+        return plugin.error(failed, cause)
+    return PluginError(f"package {plugin.package} {plugin.version} {failed}", plugin.package, cause=cause)
 
 
 def _frames(place: TracebackType | None) -> Iterator[tuple[FrameType, int]]:
@@ -211,7 +221,7 @@ def _package_of(frame: FrameType) -> str:
     return str(frame.f_globals.get("__name__", "")).partition(".")[0]
 
 
-def first_line(error: Exception) -> str:
+def first_line(error: BaseException) -> str:
     """The class and the first line of an exception."""
     return f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else 'no message'}"
 
@@ -283,7 +293,16 @@ def make_settings(kind: str, name: str, settings: dict[str, Any]) -> Any:
     """
     from persist_cli.io.settings import parse_settings
 
-    return parse_settings(load_plugin(kind, name).settings_type, settings, f"{kind} {name!r}")
+    kind_of_settings = load_plugin(kind, name).settings_type
+    try:
+        made = parse_settings(kind_of_settings, settings, f"{kind} {name!r}")
+        json.dumps(dataclasses.asdict(made))  # as in cards and memory files
+    except PersistError:
+        raise
+    except Exception as error:  # what pydantic cannot read, or what JSON cannot hold
+        cause = f"its settings cannot be used: {first_line(error)}"
+        raise find_plugin(kind, name).error(f"is broken: {cause}", cause) from error
+    return made
 
 
 def _make(kind: str, name: str, settings: dict[str, Any], *rest: Any) -> Any:

@@ -94,6 +94,76 @@ def test_a_plugin_that_cannot_say_what_is_missing_stops_no_others(persist, site)
     assert rows["voxel"]["state"] == "ok"
 
 
+def test_a_plugin_that_ends_the_process_is_shown_as_broken_and_stops_no_others(persist, site, walks, tmp_path):
+    install(site, "persist-ending", "persist.encoders", "ending = ending_encoder:Ending", "raise SystemExit(0)")
+    rows = {row["name"]: row for row in json.loads(persist("plugins", "--json").out)}
+    assert (rows["ending"]["state"], rows["voxel"]["state"]) == ("SystemExit: 0", "ok")
+    writing = "self.frame = self.encoder.encode(observations.rgb[-1:])[0].flatten(0, 1)"
+    code = LAST_FRAME.replace(writing, "raise SystemExit(0)")
+    install(site, "persist-last", "persist.memories", "last = ending_frame:LastFrame", code)
+    ended = persist("memorize", f"{walks}#0:0-3", "--memory", "last", "--out", tmp_path / "m.safetensors")
+    assert (ended.code, len(ended.err.splitlines())) == (1, 1)
+    assert "failed in LastFrame.write: SystemExit: 0" in ended.err
+
+
+SETTINGS = """
+    from dataclasses import dataclass
+    from enum import Enum
+    import torch
+    from persist_cli.api.encoder import Encoder
+
+    class Colour(Enum):
+        RED = 1
+
+    @dataclass(frozen=True)
+    class Settings:
+        value: {kind} = {value}
+
+    class Mine(Encoder):
+        settings_type = Settings
+        channels = 3
+        def encode(self, rgb): return rgb.float()
+"""
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "cause"),
+    [
+        ("Colour", "Colour.RED", "not JSON serializable"),
+        ("torch.dtype", "torch.float32", "its settings cannot be used"),
+    ],
+)
+def test_settings_that_nothing_can_keep_are_refused_before_any_work(persist, site, walks, kind, value, cause):
+    code = SETTINGS.format(kind=kind, value=value)
+    install(site, "persist-mine", "persist.encoders", f"mine = mine_{kind[:5].lower()}:Mine", code)
+    ended = persist("memorize", f"{walks}#0:0-3", "--encoder", "mine", "--out", site / "m.safetensors")
+    assert (ended.code, len(ended.err.splitlines()), (site / "m.safetensors").exists()) == (1, 1, False)
+    assert "encoder 'mine' (persist-mine 1.2, " in ended.err
+    assert cause in ended.err
+
+
+def test_two_names_of_one_class_are_refused(site):
+    code = SETTINGS.format(kind="int", value=3)
+    install(site, "persist-mine", "persist.encoders", "mine = mine_twice:Mine\nalias = mine_twice:Mine", code)
+    load_plugin("encoder", "mine")
+    with pytest.raises(PluginError, match=r"its class is that of 'mine' too; each name needs one of its own"):
+        load_plugin("encoder", "alias")
+
+
+def test_settings_that_fail_name_the_plugin_that_was_asked_for(persist, site, walks):
+    code = SETTINGS.format(kind="int", value=3).replace(
+        "value: int = 3", "value: int = 3\n        def __post_init__(self): raise OSError('no lib')"
+    )
+    entries = "mine = mine_post:Mine\nother = mine_post:Other"
+    install(site, "persist-mine", "persist.encoders", entries, code + "\n    class Other(Mine): pass\n")
+    ended = persist("memorize", f"{walks}#0:0-3", "--encoder", "other", "--out", site / "m.safetensors")
+    assert (ended.code, len(ended.err.splitlines())) == (1, 1)
+    assert (
+        "encoder 'other' (persist-mine 1.2, mine_post:Other) is broken: its settings cannot be used: OSError"
+        in ended.err
+    )
+
+
 UNFINISHED = """
     from dataclasses import dataclass
     from persist_cli.api.memory import Memory

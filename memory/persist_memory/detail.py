@@ -15,5 +15,5 @@ def pixels_across(pixels: float, cameras: Cameras, distance: float) -> float:
 
 def feature_across(encoder: Encoder, cameras: Cameras, distance: float) -> float:
     """Return the metres across that one feature of the encoder shows at a distance in metres."""
-    columns = encoder.encode(torch.zeros(1, cameras.height, cameras.width, 3, dtype=torch.uint8)).shape[2]
+    columns = encoder.encoded(torch.zeros(1, cameras.height, cameras.width, 3, dtype=torch.uint8)).shape[2]
     return pixels_across(cameras.width / columns, cameras, distance)

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from persist_cli.api.promises import check_features
 from persist_cli.io.settings import NoSettings
 
 
@@ -40,6 +41,16 @@ class Encoder(ABC):
     @abstractmethod
     def encode(self, rgb: UInt8[Tensor, "frame height width 3"]) -> Float[Tensor, "frame rows columns channel"]:
         """Return float32 features on a grid that covers the image evenly, on the encoder's device."""
+
+    def encoded(self, rgb: UInt8[Tensor, "frame height width 3"]) -> Float[Tensor, "frame rows columns channel"]:
+        """Return what ``encode`` does, after a check that it is what that promises. Memories encode by this method.
+
+        Raises:
+            PluginError: when it is not.
+        """
+        features = self.encode(rgb)
+        check_features(features, self.name, self.channels, len(rgb))
+        return features
 
     def to(self, device: torch.device | str) -> Encoder:
         """Return the encoder on ``device``; by default, without weights of its own, it stays as it is."""

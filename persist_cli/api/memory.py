@@ -18,9 +18,10 @@ from persist_cli.api.cameras import Cameras
 from persist_cli.api.encoder import Encoder
 from persist_cli.api.memory_file import FORMAT, FORMAT_VERSION
 from persist_cli.api.observations import Observations, Origin, origins_like
+from persist_cli.api.promises import check_counts, check_points, check_stored, check_tokens
 from persist_cli.api.scene_edits import Edit, EditOutcome
 from persist_cli.api.tokens import MemoryTokens
-from persist_cli.errors import CheckpointError, PersistError
+from persist_cli.errors import CheckpointError, PersistError, PluginError
 from persist_cli.io.files import write_tensors
 from persist_cli.io.settings import NoSettings
 
@@ -141,6 +142,28 @@ class Memory(ABC):
             budget: largest number of tokens, at least 0.
         """
 
+    def recall(self, cameras: Sequence[Cameras], budget: int, together: bool = False) -> list[MemoryTokens]:
+        """Return the tokens of some camera paths, after a check that they are what ``read`` promises.
+
+        All of persist reads memories by this method.
+
+        Args:
+            cameras: the paths.
+            budget: largest number of tokens of each.
+            together: whether the sample of ``read_together`` may stand for each path, where the memory has one.
+
+        Raises:
+            PluginError: when they are not.
+        """
+        of_all = self.read_together(cameras, budget) if together else None
+        read = self.read_batch(cameras, budget) if of_all is None else [of_all] * len(cameras)
+        if not isinstance(read, Sequence) or len(read) != len(cameras):
+            given = f"{len(read)} samples" if isinstance(read, Sequence) else f"a {type(read).__name__}"
+            raise PluginError(f"memory {self.name!r}: read_batch gave {given} for {len(cameras)} paths")
+        for tokens in read if of_all is None else read[:1]:
+            check_tokens(tokens, self.name, self.encoder.channels, budget)
+        return list(read)
+
     def read_batch(self, cameras: Sequence[Cameras], budget: int) -> list[MemoryTokens]:
         """Return for each camera path what ``read`` returns for it with the whole budget.
 
@@ -247,6 +270,11 @@ class Memory(ABC):
 
         Raises:
             OSError: when it cannot be written.
+            PluginError: when what the memory gives can be no memory file.
         """
+        tensors, points, figures = self.tensors(), self.points(), self.figures()
+        check_stored(tensors, self.name, PATH)
+        check_points(points.positions, points.colors, self.name)
+        check_counts(figures.cells, figures.imagined, self.name)
         poses = {PATH + name: poses.contiguous() for name, poses in (paths or {}).items()}
-        write_tensors(path, self.tensors() | poses, {"persist": json.dumps(self.header())})
+        write_tensors(path, dict(tensors) | poses, {"persist": json.dumps(self.header())})

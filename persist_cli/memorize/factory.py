@@ -94,4 +94,4 @@ def with_memory(sample: ClipSample, factory: MemoryFactory | None, budget: int) 
         return sample.clip
     memory, cameras = memory_of(sample, factory), sample.clip.observations.cameras
     memory.foresee([cameras])
-    return replace(sample.clip, tokens=memory.read(cameras, budget).to(factory.device))
+    return replace(sample.clip, tokens=memory.recall([cameras], budget)[0].to(factory.device))

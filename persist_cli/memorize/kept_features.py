@@ -60,7 +60,7 @@ class KeptFeatures(Encoder):
         features = {digest: self._kept[digest].to(self.device) for digest in digests if digest in self._kept}
         missing = {digest: number for number, digest in enumerate(digests) if digest not in features}
         if missing:
-            encoded = self.encoder.encode(rgb[list(missing.values())])
+            encoded = self.encoder.encoded(rgb[list(missing.values())])
             features |= dict(zip(missing, encoded, strict=True))
             if not encoded.is_meta:  # there is nothing to keep
                 self.keep(missing, encoded)

@@ -11,7 +11,7 @@ import copy
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -22,6 +22,7 @@ from persist_cli.api.cameras import Cameras
 from persist_cli.api.ground import Body
 from persist_cli.api.memory import Memory
 from persist_cli.api.observations import Observations, Origin, TrajectoryInfo
+from persist_cli.api.promises import check_generated
 from persist_cli.api.scene import Scene
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.data.clips import interactions_of
@@ -375,13 +376,16 @@ class WorldModel:
             clips = dataclasses.replace(clips, rgb=clips.rgb[:1], depth=clips.depth[:1])
         return clips
 
+    @torch.no_grad()
     def denoise(
         self, clips: Clips
     ) -> tuple[UInt8[Tensor, "agent frame height width 3"], Float[Tensor, "agent frame height width"]]:
         """Return RGB and depth in metres of the clips on the CPU, their first frames the present ones."""
-        rgb, depth = self.backbone.generate(clips, self.sampling)
-        return rgb.cpu(), depth.cpu()
+        cameras = clips.cameras
+        shape = (*cameras.world_from_camera.shape[:2], cameras.height, cameras.width)
+        return self._generated(self.backbone.generate(clips, self.sampling), shape)
 
+    @torch.no_grad()
     def denoise_frame(
         self, clips: Clips, frames: Sequence[int]
     ) -> tuple[UInt8[Tensor, "agent height width 3"], Float[Tensor, "agent height width"]]:
@@ -389,7 +393,13 @@ class WorldModel:
 
         It takes less time than whole clips where the codec codes frames alone.
         """
-        rgb, depth = self.backbone.generate_frame(clips, self.sampling, frames)
+        shape = (len(frames), clips.cameras.height, clips.cameras.width)
+        return self._generated(self.backbone.generate_frame(clips, self.sampling, frames), shape)
+
+    def _generated(self, images: Any, shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+        """Generated RGB and depth on the CPU, after a check that they are what the backbone promises."""
+        check_generated(images, self.backbone.name, shape)
+        rgb, depth = images
         return rgb.cpu(), depth.cpu()
 
     def clip_path(self, agent: Agent, way: Cameras) -> Cameras:
@@ -414,10 +424,8 @@ class WorldModel:
 
     def read_memory(self, memory: Memory, paths: Sequence[Cameras]) -> list[MemoryTokens]:
         """Return a memory's tokens of each path: one sample for all where tokens are drawn and the memory has that."""
-        budget, together = self.backbone.token_budget, None
-        if len(paths) > 1 and self.backbone.draws_tokens:
-            together = memory.read_together(paths, budget)
-        return memory.read_batch(paths, budget) if together is None else [together] * len(paths)
+        together = len(paths) > 1 and self.backbone.draws_tokens
+        return memory.recall(paths, self.backbone.token_budget, together)
 
 
 def cameras_along(camera: Cameras, info: TrajectoryInfo, actions: Sequence[str]) -> Cameras:

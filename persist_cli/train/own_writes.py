@@ -93,7 +93,7 @@ class OwnWrites:
             return clip
         cameras = clip.observations.cameras
         chain.memory.foresee([cameras])
-        tokens = chain.memory.read(cameras, self.encoder.backbone.token_budget)
+        tokens = chain.memory.recall([cameras], self.encoder.backbone.token_budget)[0]
         return replace(clip, tokens=tokens.to(self.encoder.factory.device))
 
     def _end(self, chain: Chain) -> CachedSample:

@@ -19,6 +19,7 @@ from torch import nn
 from torch.utils.data import DataLoader, Dataset
 
 from persist_cli.api.checkpoint import TrainingScenes
+from persist_cli.api.promises import check_losses
 from persist_cli.checkpoints.lineage import Lineage
 from persist_cli.data.clips import DistributedBatches
 from persist_cli.errors import PersistError
@@ -214,6 +215,7 @@ class TrainingLoop(ABC, Generic[Model]):
             with self.synchronized(last=number == settings.accumulation):
                 with times.part("forward"), accelerator.autocast():  # accelerate leaves it out when it shards
                     losses = self.model(batch, self.recipe.stage)
+                    check_losses(losses, type(self.whole).__name__)
                 with times.part("backward"):  # DeepSpeed divides the loss itself
                     accelerator.backward(losses["loss"] / (1 if self.zero else settings.accumulation))
             for name, loss in losses.items():

@@ -51,7 +51,7 @@ def plugin_state(plugin: Plugin, claims: int) -> str:
         missing = loaded.missing() if plugin.kind in ("simulator", "cost") else ""
     except PluginError as error:
         return error.cause
-    except Exception as error:  # a plugin may raise anything, and the others are listed all the same
+    except (Exception, SystemExit) as error:  # a plugin may raise anything, and the others are listed all the same
         return f"its missing() raised {first_line(error)}"
     return missing or "ok"
 

@@ -182,7 +182,7 @@ class FrameMemory(Memory):
     def _features(self, store: FrameStore) -> Float[Tensor, "frame channel"]:
         if not len(store):
             return torch.zeros(0, self.encoder.channels, device=store.images.device)
-        return self.encoder.encode(store.images).float().mean(dim=(1, 2)).to(store.images.device)
+        return self.encoder.encoded(store.images).float().mean(dim=(1, 2)).to(store.images.device)
 
 
 def frame_stores(memories: Sequence[Memory]) -> list[FrameStore]:

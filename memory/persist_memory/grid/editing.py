@@ -117,7 +117,7 @@ def _painted(
 ) -> dict[str, Tensor]:
     """Return the tensors with cells that are as if a picture of the colour alone had been seen there."""
     picture = torch.tensor(edit.color, dtype=torch.uint8).expand(1, PICTURE, PICTURE, 3)
-    encoded = form.encoder.encode(picture.to(tensors[CELLS].device))[0]
+    encoded = form.encoder.encoded(picture.to(tensors[CELLS].device))[0]
     painted = {name: tensor.clone() for name, tensor in tensors.items()}
     red, green, blue = edit.color
     painted["colors"][inside] = (red << 16) | (green << 8) | blue  # at depth 0: no later pixel is nearer

@@ -239,7 +239,7 @@ class GridMemory(Memory):
 
     def _pool(self, observations: Observations, origin: Origin, once: bool) -> None:
         """Pool frames into their cells; ``once`` leaves out those that there are."""
-        features = self.encoder.encode(observations.rgb).to(observations.depth.device, torch.float32)
+        features = self.encoder.encoded(observations.rgb).to(observations.depth.device, torch.float32)
         runs = find_runs(observations, self.lattice, self.settings, features.shape[2])
         if not len(runs.keys):
             return

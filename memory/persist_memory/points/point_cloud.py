@@ -158,7 +158,7 @@ class PointCloud(Memory):
         valid = (depth > 0) & (depth <= (self.settings.max_depth or torch.inf))
         if not bool(valid.any()):
             return {}
-        features = self.encoder.encode(frames.rgb).to(device, torch.float32)
+        features = self.encoder.encoded(frames.rgb).to(device, torch.float32)
         places = unproject(frames.depth, frames.cameras)[:, rows[:, None], columns]
         colors = frames.rgb[:, rows[:, None], columns]
         pixels = torch.stack(torch.meshgrid(rows, columns, indexing="ij"), dim=-1).expand(*depth.shape, 2)

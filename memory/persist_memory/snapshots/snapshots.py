@@ -104,7 +104,7 @@ class Snapshots(Memory):
         for origin, frames in observations.by_origin():
             for begin in range(0, len(frames), FRAMES_AT_ONCE):
                 part = frames[begin : begin + FRAMES_AT_ONCE]
-                features = self.encoder.encode(part.rgb).to(part.depth.device)
+                features = self.encoder.encoded(part.rgb).to(part.depth.device)
                 self._add(SnapshotStore.of(part, features, self.settings.grid), origin)
 
     def read(self, cameras: Cameras, budget: int) -> MemoryTokens:

@@ -1,0 +1,194 @@
+"""What a plugin promises to return, checked where it is taken.
+
+What a plugin raises becomes one line that names it. These checks make one line of what it returns wrongly, which would
+go on as a black frame, a map that cannot be read again, or an error far from its cause.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, Final
+
+import torch
+from torch import Tensor
+
+from persist_cli.api.observations import Origin
+from persist_cli.api.tokens import MemoryTokens
+from persist_cli.errors import PluginError
+
+LOGGED: Final = ("step", "seconds", "learning_rate")  # of each step of a training, in its log
+
+TOKEN_PARTS: Final[dict[str, tuple[torch.dtype, tuple[int | None, ...]]]] = {  # type, and shape of a token
+    "features": (torch.float32, (None,)),
+    "positions": (torch.float64, (3,)),
+    "mask": (torch.bool, ()),
+    "colors": (torch.uint8, (3,)),
+    "origins": (torch.uint8, ()),
+    "distances": (torch.float32, ()),
+    "images": (torch.uint8, (None, None, 3)),
+    "world_from_camera": (torch.float64, (4, 4)),
+    "intrinsics": (torch.float64, (3, 3)),
+}
+
+
+def check_tokens(tokens: Any, memory: str, channels: int, budget: int) -> None:
+    """Raise ``PluginError`` when a memory's tokens of a path are not what ``Memory.read`` promises.
+
+    Args:
+        tokens: what the memory returned.
+        memory: its name.
+        channels: features of its encoder.
+        budget: the largest number of tokens that was asked for.
+    """
+    if not isinstance(tokens, MemoryTokens):
+        raise _broken("memory", memory, f"read gave {_kind(tokens)}, not MemoryTokens")
+    flaw = _wrong_part(tokens)
+    if not flaw and len(tokens) > budget:
+        flaw = f"{len(tokens)} tokens of at most {budget}"
+    if not flaw and tokens.features.shape[1] != channels:
+        flaw = f"{tokens.features.shape[1]} features, where its encoder has {channels}"
+    if flaw:
+        raise _broken("memory", memory, f"read gave {flaw}")
+
+
+def _wrong_part(tokens: MemoryTokens) -> str:
+    """What is wrong with a tensor of a sample of tokens, empty when nothing is."""
+    parts = tokens.tensors()
+    for name, (dtype, shape) in TOKEN_PARTS.items():
+        if name not in parts and name in ("features", "positions", "mask"):
+            return f"tokens without {name}"
+        if name in parts and not _is_of(parts[name], dtype, (None, *shape)):
+            wanted = f"{str(dtype).removeprefix('torch.')} {_shape(('token', *shape))}"
+            return f"{name} as {_kind(parts[name])}, not {wanted}"
+    lengths = {name: len(parts[name]) for name in TOKEN_PARTS if name in parts}
+    if len(set(lengths.values())) > 1:
+        return f"tokens of several lengths: {', '.join(f'{length} {name}' for name, length in lengths.items())}"
+    if not is_finite(tokens.features) or not is_finite(tokens.positions):
+        return "features or positions that are not finite"
+    if len(tokens) and not tokens.origins.is_meta and int(tokens.origins.amax()) > max(Origin):
+        return f"origins beyond {int(max(Origin))}"
+    return ""
+
+
+def check_stored(tensors: Any, memory: str, reserved: str) -> None:
+    """Raise ``PluginError`` when what a memory stores cannot be a memory file.
+
+    Args:
+        tensors: what ``Memory.tensors`` returned.
+        memory: its name.
+        reserved: no tensor's name may begin with this.
+    """
+    if not isinstance(tensors, Mapping):
+        raise _broken("memory", memory, f"tensors gave {_kind(tensors)}, not tensors by name")
+    for name, tensor in tensors.items():
+        if not isinstance(name, str) or name.startswith(reserved):
+            raise _broken("memory", memory, f"tensors gave a name {name!r}; no name begins with {reserved!r}")
+        if not isinstance(tensor, Tensor) or not tensor.ndim or tensor.is_complex():
+            raise _broken("memory", memory, f"tensors gave {name} as {_kind(tensor)}, not a tensor of items")
+
+
+def check_points(positions: Any, colors: Any, memory: str) -> None:
+    """Raise ``PluginError`` when the points of a memory cannot be drawn.
+
+    Args:
+        positions: those of ``Memory.points``, metres.
+        colors: their colours.
+        memory: the memory's name.
+    """
+    if not (isinstance(positions, Tensor) and positions.is_floating_point() and positions.shape[1:] == (3,)):
+        raise _broken("memory", memory, f"points gave positions as {_kind(positions)}, not float [point, 3]")
+    if not _is_of(colors, torch.uint8, (len(positions), 3)):
+        raise _broken("memory", memory, f"points gave colours as {_kind(colors)}, not uint8 [{len(positions)}, 3]")
+    if not is_finite(positions):
+        raise _broken("memory", memory, "points gave positions that are not finite")
+
+
+def check_counts(cells: Any, imagined: Any, memory: str) -> None:
+    """Raise ``PluginError`` when the figures of a memory are no numbers of items, some of them imagined."""
+    if not all(isinstance(count, int) for count in (cells, imagined)) or not 0 <= imagined <= cells:
+        raise _broken("memory", memory, f"figures gave {imagined!r} imagined of {cells!r} items")
+
+
+def check_features(features: Any, encoder: str, channels: Any, frames: int) -> None:
+    """Raise ``PluginError`` when an encoder's features are not what ``Encoder.encode`` promises.
+
+    Args:
+        features: what the encoder returned.
+        encoder: its name.
+        channels: the number of features that it says to have.
+        frames: number of images that it was given.
+    """
+    if isinstance(channels, bool) or not isinstance(channels, int) or channels < 1:
+        raise _broken("encoder", encoder, f"its channels are {channels!r}, not a number from 1 on")
+    if not (isinstance(features, Tensor) and features.is_floating_point() and features.ndim == 4):
+        raise _broken("encoder", encoder, f"encode gave {_kind(features)}, not float [frame, rows, columns, channel]")
+    if len(features) != frames or features.shape[3] != channels or not features[0].numel():
+        wanted = f"{frames} frames of [rows, columns, {channels}]"
+        raise _broken("encoder", encoder, f"encode gave {_kind(features)}, not {wanted}")
+    if not is_finite(features):
+        raise _broken("encoder", encoder, "encode gave features that are not finite")
+
+
+def check_generated(images: Any, backbone: str, shape: tuple[int, ...]) -> None:
+    """Raise ``PluginError`` when generated images are not what ``Backbone.generate`` promises.
+
+    Args:
+        images: what the backbone returned: colours, and depth in metres.
+        backbone: its name.
+        shape: that of the depth: clips, frames with the first one, where there are several, height and width.
+    """
+    if not isinstance(images, tuple | list) or len(images) != 2:
+        raise _broken("backbone", backbone, f"gave {_kind(images)}, not colours and depth")
+    rgb, depth = images
+    if not _is_of(rgb, torch.uint8, (*shape, 3)):
+        raise _broken("backbone", backbone, f"gave colours as {_kind(rgb)}, not uint8 {_shape((*shape, 3))}")
+    if not (isinstance(depth, Tensor) and depth.is_floating_point() and tuple(depth.shape) == shape):
+        raise _broken("backbone", backbone, f"gave depth as {_kind(depth)}, not float {_shape(shape)}")
+    if not is_finite(depth) or bool((depth < 0).any()):
+        raise _broken("backbone", backbone, "gave depth that is negative or not finite")
+
+
+def check_losses(losses: Any, model: str) -> None:
+    """Raise ``PluginError`` when a model's ``forward`` does not give scalar tensors by name, ``loss`` among them.
+
+    Args:
+        losses: what the model returned.
+        model: the name of its class.
+    """
+    what = f"{model}: forward gave"
+    if not isinstance(losses, Mapping) or "loss" not in losses:
+        raise PluginError(f"{what} {_kind(losses)}, not a mapping of scalar tensors with 'loss'")
+    for name, value in losses.items():
+        if not isinstance(value, Tensor) or value.ndim:
+            raise PluginError(f"{what} {name} as {_kind(value)}, not a scalar tensor")
+        if name in LOGGED:
+            raise PluginError(f"{what} {name}, under which the log has something else; name it otherwise")
+    if not losses["loss"].requires_grad:
+        raise PluginError(f"{what} a loss without a gradient")
+
+
+def is_finite(values: Tensor) -> bool:
+    """Whether all of many numbers are finite; those without content are. A sum tells it soonest."""
+    return values.is_meta or math.isfinite(float(values.sum()))
+
+
+def _is_of(value: Any, dtype: torch.dtype, shape: tuple[int | None, ...]) -> bool:
+    if not isinstance(value, Tensor) or value.dtype != dtype or value.ndim != len(shape):
+        return False
+    return all(size in (None, length) for size, length in zip(shape, value.shape, strict=True))
+
+
+def _kind(value: Any) -> str:
+    """A value in words: a tensor by its type and shape, anything else by its class."""
+    if isinstance(value, Tensor):
+        return f"{str(value.dtype).removeprefix('torch.')} {_shape(tuple(value.shape))}"
+    return "None" if value is None else f"a {type(value).__name__}"
+
+
+def _shape(sizes: tuple[object, ...]) -> str:
+    return f"[{', '.join('…' if size is None else str(size) for size in sizes)}]"
+
+
+def _broken(kind: str, name: str, cause: str) -> PluginError:
+    return PluginError(f"{kind} {name!r}: {cause}", cause=cause)

@@ -1,0 +1,146 @@
+"""What a plugin returns wrongly is one line that names it, where it is taken."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from persist_cli.api.promises import (
+    check_counts,
+    check_features,
+    check_generated,
+    check_losses,
+    check_points,
+    check_stored,
+    check_tokens,
+)
+from persist_cli.api.tokens import MemoryTokens
+from persist_cli.errors import PluginError
+
+TOKENS = MemoryTokens.of(torch.ones(5, 32), torch.ones(5, 3), torch.zeros(5, 3, dtype=torch.uint8))
+LOSS = torch.ones(3, requires_grad=True)
+
+
+def changed(**parts: object) -> MemoryTokens:
+    """The tokens with other parts."""
+    return replace(TOKENS, **parts)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("tokens", "cause"),
+    [
+        (None, "read gave None, not MemoryTokens"),
+        ([TOKENS], "read gave a list, not MemoryTokens"),
+        (MemoryTokens.stack([TOKENS]), r"features as float32 \[1, 5, 32\], not float32 \[token, …\]"),
+        (changed(features=torch.ones(5, 32).half()), r"features as float16 \[5, 32\]"),
+        (changed(positions=None), "tokens without positions"),
+        (changed(positions=torch.ones(3, 3).double()), "several lengths: 5 features, 3 positions, 5 mask"),
+        (changed(mask=torch.ones(5)), r"mask as float32 \[5\], not bool \[token\]"),
+        (changed(colors=torch.ones(5, 3)), r"colors as float32 \[5, 3\], not uint8 \[token, 3\]"),
+        (changed(origins=torch.full((5,), 7, dtype=torch.uint8)), "origins beyond 2"),
+        (changed(features=torch.full((5, 32), torch.nan)), "not finite"),
+        (changed(positions=torch.full((5, 3), torch.inf).double()), "not finite"),
+        (changed(features=torch.ones(5, 31)), "31 features, where its encoder has 32"),
+        (MemoryTokens.of(torch.ones(9, 32), torch.ones(9, 3)), "9 tokens of at most 8"),
+    ],
+)
+def test_tokens_that_no_memory_promises_name_the_memory(tokens, cause):
+    with pytest.raises(PluginError, match=f"^memory 'last': .*{cause}"):
+        check_tokens(tokens, "last", 32, 8)
+
+
+@pytest.mark.parametrize("tokens", [TOKENS, MemoryTokens.empty(32)])
+def test_tokens_as_promised_pass(tokens):
+    check_tokens(tokens, "last", 32, 8)
+
+
+@pytest.mark.parametrize(
+    ("features", "channels", "cause"),
+    [
+        (None, 4, r"encode gave None, not float \[frame, rows, columns, channel\]"),
+        (torch.zeros(2, 3, 3, 4).numpy(), 4, "encode gave a ndarray"),
+        (torch.zeros(2, 3, 3, 4, dtype=torch.uint8), 4, r"encode gave uint8 \[2, 3, 3, 4\], not float"),
+        (torch.zeros(2, 9, 4), 4, r"float32 \[2, 9, 4\], not float \[frame"),
+        (torch.zeros(1, 3, 3, 4), 4, r"not 2 frames of \[rows, columns, 4\]"),
+        (torch.zeros(2, 4, 3, 3), 4, r"float32 \[2, 4, 3, 3\], not 2 frames"),
+        (torch.zeros(2, 0, 3, 4), 4, r"float32 \[2, 0, 3, 4\], not 2 frames"),
+        (torch.full((2, 3, 3, 4), torch.nan), 4, "features that are not finite"),
+        (torch.zeros(2, 3, 3, 4), 4.0, "its channels are 4.0, not a number from 1 on"),
+        (torch.zeros(2, 3, 3, 4), None, "its channels are None"),
+    ],
+)
+def test_features_that_no_encoder_promises_name_the_encoder(features, channels, cause):
+    with pytest.raises(PluginError, match=f"^encoder 'mine': .*{cause}"):
+        check_features(features, "mine", channels, 2)
+
+
+@pytest.mark.parametrize(
+    ("rgb", "depth", "cause"),
+    [
+        (None, torch.zeros(1, 3, 4, 4), r"colours as None, not uint8 \[1, 3, 4, 4, 3\]"),
+        (torch.zeros(1, 2, 4, 4, 3, dtype=torch.uint8), torch.zeros(1, 2, 4, 4), r"uint8 \[1, 2, 4, 4, 3\]"),
+        (torch.zeros(1, 3, 4, 4, 3), torch.zeros(1, 3, 4, 4), "colours as float32"),
+        (torch.zeros(1, 3, 4, 4, 3, dtype=torch.uint8), None, "depth as None"),
+        (torch.zeros(1, 3, 4, 4, 3, dtype=torch.uint8), torch.zeros(1, 3, 4, 4, 1), "depth as float32"),
+        (torch.zeros(1, 3, 4, 4, 3, dtype=torch.uint8), torch.full((1, 3, 4, 4), -1.0), "negative or not finite"),
+        (torch.zeros(1, 3, 4, 4, 3, dtype=torch.uint8), torch.full((1, 3, 4, 4), torch.nan), "negative or not finite"),
+    ],
+)
+def test_images_that_no_backbone_promises_name_the_backbone(rgb, depth, cause):
+    with pytest.raises(PluginError, match=f"^backbone 'toy': gave .*{cause}"):
+        check_generated((rgb, depth), "toy", (1, 3, 4, 4))
+
+
+@pytest.mark.parametrize(
+    ("losses", "cause"),
+    [
+        (LOSS.sum(), r"float32 \[\], not a mapping"),
+        ({"error": LOSS.sum()}, "not a mapping of scalar tensors with 'loss'"),
+        ({"loss": LOSS}, r"loss as float32 \[3\], not a scalar tensor"),
+        ({"loss": LOSS.sum(), "error": 0.3}, "error as a float, not a scalar tensor"),
+        ({"loss": LOSS.sum().detach()}, "a loss without a gradient"),
+        ({"loss": LOSS.sum(), "step": LOSS.sum()}, "step, under which the log has something else"),
+    ],
+)
+def test_losses_that_cannot_be_trained_on_name_the_model(losses, cause):
+    with pytest.raises(PluginError, match=f"^Toy: forward gave .*{cause}"):
+        check_losses(losses, "Toy")
+
+
+@pytest.mark.parametrize(
+    ("tensors", "cause"),
+    [
+        ([torch.ones(3)], "tensors gave a list"),
+        ({"path:there": torch.ones(3)}, "a name 'path:there'"),
+        ({3: torch.ones(3)}, "a name 3"),
+        ({"cells": None}, "cells as None"),
+        ({"cells": torch.ones(())}, r"cells as float32 \[\]"),
+        ({"cells": torch.ones(3).numpy()}, "cells as a ndarray"),
+        ({"cells": torch.ones(3, dtype=torch.complex64)}, "cells as complex64"),
+    ],
+)
+def test_what_can_be_no_memory_file_names_the_memory(tensors, cause):
+    with pytest.raises(PluginError, match=f"^memory 'last': tensors gave .*{cause}" if "gave" not in cause else cause):
+        check_stored(tensors, "last", "path:")
+
+
+@pytest.mark.parametrize(
+    ("positions", "colors", "cause"),
+    [
+        (None, None, "positions as None"),
+        (torch.ones(4, 2), torch.zeros(4, 3, dtype=torch.uint8), r"positions as float32 \[4, 2\]"),
+        (torch.ones(4, 3), torch.zeros(5, 3, dtype=torch.uint8), r"colours as uint8 \[5, 3\], not uint8 \[4, 3\]"),
+        (torch.full((4, 3), torch.nan), torch.zeros(4, 3, dtype=torch.uint8), "positions that are not finite"),
+    ],
+)
+def test_points_that_cannot_be_drawn_name_the_memory(positions, colors, cause):
+    with pytest.raises(PluginError, match=f"^memory 'last': points gave {cause}"):
+        check_points(positions, colors, "last")
+
+
+@pytest.mark.parametrize(("cells", "imagined"), [(3, 5), (3, -1), (3.5, 0), (torch.tensor(3), 0), (None, 0)])
+def test_figures_that_are_no_numbers_of_items_name_the_memory(cells, imagined):
+    with pytest.raises(PluginError, match=r"^memory 'last': figures gave"):
+        check_counts(cells, imagined, "last")
