@@ -225,5 +225,6 @@ def warn_of_plain(checkpoint: Checkpoint, sampling: Sampling) -> None:
 
 
 def starts_from_random_codec(recipe: Recipe, backbone: Backbone) -> bool:
-    """Whether a recipe trains the video model on the latents of a codec with random weights."""
-    return recipe.stage == "1" and recipe.base is None and not backbone.origin()
+    """Whether a recipe trains the video model on the latents of a random codec, of a backbone that has trained ones."""
+    settings = {field.name for field in dataclasses.fields(type(backbone).settings_type)}
+    return recipe.stage == "1" and recipe.base is None and "pretrained" in settings and not backbone.origin()

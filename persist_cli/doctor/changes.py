@@ -83,6 +83,8 @@ BITSANDBYTES: Final = "bitsandbytes"  # the package of the 8-bit optimizer, and 
 OFFLOAD: Final = Change("CPU offload", (), 8, (SHARDED, OFFLOADED))
 LORA: Final = Change("LoRA", ("lora.rank=64",), 16)
 
+SAVINGS: Final = (SLICING, FROZEN, FROZEN_UNSHARDED, CHECKPOINTING)  # which a backbone may not support
+
 STAGE2: Final = Strategy((Change("stage 2 only", (), 0),))  # no change but another recipe, that of the next stage
 
 

@@ -17,6 +17,7 @@ from persist_cli.doctor.changes import (
     EIGHT_BIT,
     LORA,
     OFFLOADED,
+    SAVINGS,
     SHARDED,
     STAGE2,
     Change,
@@ -34,6 +35,7 @@ from persist_cli.doctor.meta_model import (
     build_scene_meta_model,
     build_stage2_meta_model,
 )
+from persist_cli.doctor.step import check_savings
 from persist_cli.errors import PersistError
 from persist_cli.recipe import Recipe, apply_overrides, make_recipe, of_the_whole_model, to_plain
 from persist_cli.train.distributed import check_sharded
@@ -84,10 +86,12 @@ class Doctor:
 
     def can_make(self, change: Change) -> bool:
         """Whether backbone and installation can make a change that they may lack; else it is ``not_considered``."""
-        if change is not LORA:
-            return True
+        recipe = self.changed_recipe(Strategy((change,)))
         try:
-            self.estimator(self.changed_recipe(Strategy((change,))))
+            if change is LORA:
+                self.estimator(recipe)
+            elif change in SAVINGS and isinstance(self.meta_model, MetaModel):
+                check_savings(self.meta_model.backbone, recipe)
         except PersistError as error:
             self.not_considered[change.name] = str(error)
             return False

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
+
+from torch import nn
 
 from persist_cli.api.meta_device import without_weights
 from persist_cli.api.stages import ParameterGroup, Stage
@@ -37,7 +39,7 @@ def dry_run(meta_model: MetaModel) -> dict[str, Any]:
         "stage": meta_model.recipe.stage,
         "backbone": meta_model.backbone.name,
         "base": str(meta_model.base.folder) if meta_model.base else None,
-        **_parts(groups, {stage: set(meta_model.backbone.trained_parameters(stage)) for stage in stages}),
+        **_parts(groups, {stage: identities(meta_model.backbone.trained_parameters(stage)) for stage in stages}),
     }
 
 
@@ -54,18 +56,23 @@ def network_dry_run(recipe: Recipe) -> dict[str, Any]:
     with without_weights():
         if recipe.policy is not None:
             network = make_network(recipe.policy.name, recipe.policy.settings)
-            trained: dict[Stage, set[str]] = {"policy": set(network.trained_parameters())}
+            trained: dict[Stage, set[int]] = {"policy": identities(network.trained_parameters())}
             named = {"stage": recipe.stage, "policy": recipe.policy.name, "base": recipe.base}
             return named | _parts(network.parameter_groups(), trained)
         assert recipe.scene is not None
         model = make_scene_model(recipe.scene.name, recipe.scene.settings)
     check_stage(model, recipe.stage)
-    trained = {stage: set(model.trained_parameters(stage)) for stage in model.stages}
+    trained = {stage: identities(model.trained_parameters(stage)) for stage in model.stages}
     named = {"stage": recipe.stage, "scene": recipe.scene.name, "base": recipe.base}
     return named | _parts(model.parameter_groups(), trained)
 
 
-def _parts(groups: Sequence[ParameterGroup], trained: dict[Stage, set[str]]) -> dict[str, Any]:
+def identities(parameters: Mapping[str, nn.Parameter]) -> set[int]:
+    """The identities of parameters, which may have other names in a part of the model than in the whole."""
+    return {id(parameter) for parameter in parameters.values()}
+
+
+def _parts(groups: Sequence[ParameterGroup], trained: dict[Stage, set[int]]) -> dict[str, Any]:
     parts = [_part(group, trained) for group in groups]
     total = {
         "name": "total",
@@ -75,15 +82,15 @@ def _parts(groups: Sequence[ParameterGroup], trained: dict[Stage, set[str]]) -> 
     return {"parts": parts, "total": total}
 
 
-def _part(group: ParameterGroup, trained: dict[Stage, set[str]]) -> dict[str, Any]:
-    sizes = {name: parameter.numel() for name, parameter in group.parameters.items()}
+def _part(group: ParameterGroup, trained: dict[Stage, set[int]]) -> dict[str, Any]:
+    sizes = {id(parameter): parameter.numel() for parameter in group.parameters.values()}
     parameters = sum(sizes.values())
     return {
         "name": group.name,
         "parameters": parameters,
         "bytes": sum(parameter.numel() * parameter.element_size() for parameter in group.parameters.values()),
         "new": parameters if group.new else 0,
-        "trained": {stage: sum(sizes[name] for name in sizes if name in names) for stage, names in trained.items()},
+        "trained": {stage: sum(sizes[one] for one in sizes if one in among) for stage, among in trained.items()},
         "shapes": {name: list(parameter.shape) for name, parameter in group.parameters.items()},
     }
 

@@ -174,6 +174,15 @@ class ShallowCopies(StepCopies):
                 yield backbone, live
 
 
+def check_savings(model: Backbone, recipe: Recipe) -> None:
+    """Raise ``PersistError`` when a model without weights does not support a saving that its recipe asks for."""
+    backbone = copy.deepcopy(model)
+    with fake_tensors():
+        _fill_with_fakes(backbone)
+        backbone.trained_parameters(recipe.stage)
+        backbone.apply_memory_savings(recipe.stage, requested_savings(recipe.training, torch.device("cpu")))
+
+
 def _fill_with_fakes(model: nn.Module) -> None:
     """Put fake tensors of the CPU in the place of those of the meta device."""
     # to_empty would make two fake tensors for each parameter, one of it as it is and the new one

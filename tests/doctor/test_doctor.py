@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from persist_backbones.cogvideox.inputs import _fitted_positions
+from persist_cli.api.backbone import Backbone
 from persist_cli.api.clips import ClipLatents
 from persist_cli.doctor.changes import CHECKPOINTING, EIGHT_BIT, FROZEN, LORA, OFFLOAD, Strategy, strategies
 from persist_cli.doctor.doctor import Doctor, _verdict, launch_command
@@ -335,3 +336,12 @@ def test_the_optimizer_of_a_package_that_is_not_here_comes_with_its_installation
     doctor.estimators[None] = estimator()
     verdict = _verdict(doctor, [], doctor.examine(Strategy((EIGHT_BIT,))))
     assert "\npip install 'persist-cli[bitsandbytes]'\npersist finetune tiny-stage1 " in verdict
+
+
+def test_a_saving_that_a_backbone_does_not_support_is_not_considered(monkeypatch):
+    meta_model = micro_meta_model()
+    monkeypatch.setattr(type(meta_model.backbone), "apply_memory_savings", Backbone.apply_memory_savings)
+    doctor = Doctor(meta_model, Machine("cuda", 1, GIB), sharded=False)
+    assert {"VAE slicing", "frozen in bf16", "gradient checkpointing"} == doctor.not_considered.keys()
+    assert all("has no cheaper steps" in cause for cause in doctor.not_considered.values())
+    assert not {CHECKPOINTING, FROZEN} & {*doctor.changes}
