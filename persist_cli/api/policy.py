@@ -12,6 +12,7 @@ from torch import Tensor
 
 from persist_cli.api.ground import GroundMap
 from persist_cli.api.observations import Observations, TrajectoryInfo
+from persist_cli.api.promises import check_proposals
 from persist_cli.io.settings import NoSettings
 
 if TYPE_CHECKING:
@@ -78,6 +79,18 @@ class Policy(ABC):
     def longest(self) -> int | None:
         """The largest number of actions that it can look ahead; ``None`` for any."""
         return None
+
+    def proposals(
+        self, situation: Situation, horizon: int, count: int, generator: torch.Generator
+    ) -> list[tuple[str, ...]]:
+        """Return what ``propose`` does, after a check that it is what that promises. Persist asks by this method.
+
+        Raises:
+            PluginError: when it is not.
+        """
+        proposed = self.propose(situation, horizon, count, generator)
+        check_proposals(proposed, self.name, situation.info.vocabulary.names, horizon, count)
+        return [tuple(names) for names in proposed]
 
     @abstractmethod
     def propose(

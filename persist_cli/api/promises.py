@@ -7,7 +7,7 @@ go on as a black frame, a map that cannot be read again, or an error far from it
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Final
 
 import torch
@@ -147,6 +147,41 @@ def check_generated(images: Any, backbone: str, shape: tuple[int, ...]) -> None:
         raise _broken("backbone", backbone, f"gave depth as {_kind(depth)}, not float {_shape(shape)}")
     if not is_finite(depth) or bool((depth < 0).any()):
         raise _broken("backbone", backbone, "gave depth that is negative or not finite")
+
+
+def check_proposals(proposed: Any, policy: str, known: Collection[str], horizon: int, count: int) -> None:
+    """Raise ``PluginError`` when the proposals of a policy are not what ``Policy.propose`` promises.
+
+    Args:
+        proposed: what the policy returned.
+        policy: its name.
+        known: names of the actions that there are.
+        horizon: the largest number of actions of a proposal.
+        count: the number of proposals that was asked for.
+    """
+    if not isinstance(proposed, Sequence) or len(proposed) != count:
+        given = f"{len(proposed)} of them" if isinstance(proposed, Sequence) else _kind(proposed)
+        raise _broken("policy", policy, f"propose gave {given}, not {count} sequences of actions")
+    for names in proposed:
+        if isinstance(names, str) or not isinstance(names, Sequence):
+            raise _broken("policy", policy, f"propose gave {names!r}, not a sequence of actions")
+        if len(names) > horizon:
+            raise _broken("policy", policy, f"propose gave {len(names)} actions of at most {horizon}")
+        for name in names:
+            if name not in known:
+                raise _broken("policy", policy, f"propose gave the action {name!r}; known: {', '.join(known)}")
+
+
+def check_costs(costs: Any, cost: str, shape: tuple[int, int]) -> None:
+    """Raise ``PluginError`` when costs are not what ``Cost.measure`` promises; NaN may come of imagined frames.
+
+    Args:
+        costs: what the cost returned.
+        cost: its name.
+        shape: candidates, and frames of each.
+    """
+    if not (isinstance(costs, Tensor) and costs.is_floating_point() and tuple(costs.shape) == shape):
+        raise _broken("cost", cost, f"measure gave {_kind(costs)}, not float {_shape(shape)}")
 
 
 def check_losses(losses: Any, model: str) -> None:

@@ -323,4 +323,4 @@ def _first_proposal(
 ) -> tuple[str, ...]:
     if policy is None:
         raise ValueError("a row that does not imagine needs a policy")
-    return tuple(policy.propose(situation, horizon, 1, generator)[0])
+    return tuple(policy.proposals(situation, horizon, 1, generator)[0])

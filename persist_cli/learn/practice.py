@@ -159,12 +159,14 @@ class Walker:
         situation = Situation(self.seen[-self.policy.frames :], self.info, self.goal, ground)
         horizon = min(self.settings.execute, self.policy.longest or self.settings.execute)
         if self.random.random() < self.settings.explore:
-            way = self.explorer.propose(situation, horizon, 1, self.generator)[0]
+            way = self.explorer.proposals(situation, horizon, 1, self.generator)[0]
         else:
-            way = self._chosen(self.policy.propose(situation, horizon, self.settings.proposals, self.generator), ground)
+            way = self._chosen(
+                self.policy.proposals(situation, horizon, self.settings.proposals, self.generator), ground
+            )
         if not way:
             self._new_goal()
-            way = self.explorer.propose(situation, horizon, 1, self.generator)[0]
+            way = self.explorer.proposals(situation, horizon, 1, self.generator)[0]
         return tuple(way[: min(horizon, self.settings.actions - self.taken)])
 
     def _chosen(self, ways: Sequence[tuple[str, ...]], ground: GroundMap) -> tuple[str, ...]:

@@ -113,7 +113,7 @@ class Rank:
         while number < self.settings.rounds and not judge.exhausted:
             number += 1
             kept = [self._last] if self._last and number == 1 else []
-            proposals = self.policy.propose(situation, horizon, max(count - len(kept), 1), generator)
+            proposals = self.policy.proposals(situation, horizon, max(count - len(kept), 1), generator)
             judge.judge([*kept, *proposals][:count], number)
             on_round(number, least(judge))
         plan = finished(judge, number)
@@ -256,7 +256,7 @@ class Cem:
         count = round(self.settings.proposed * self.settings.candidates)
         if self.policy is None or not count:
             return []
-        proposals = self.policy.propose(situation, self.settings.horizon, count, generator)
+        proposals = self.policy.proposals(situation, self.settings.horizon, count, generator)
         return [proposal for proposal in proposals if set(proposal) <= set(names)]
 
     def _begin(self, names: Sequence[str]) -> tuple[Float[Tensor, "action name"], list[tuple[str, ...]]]:

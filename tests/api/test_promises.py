@@ -8,11 +8,13 @@ import pytest
 import torch
 
 from persist_cli.api.promises import (
+    check_costs,
     check_counts,
     check_features,
     check_generated,
     check_losses,
     check_points,
+    check_proposals,
     check_stored,
     check_tokens,
 )
@@ -144,3 +146,29 @@ def test_points_that_cannot_be_drawn_name_the_memory(positions, colors, cause):
 def test_figures_that_are_no_numbers_of_items_name_the_memory(cells, imagined):
     with pytest.raises(PluginError, match=r"^memory 'last': figures gave"):
         check_counts(cells, imagined, "last")
+
+
+@pytest.mark.parametrize(
+    ("proposed", "cause"),
+    [
+        (None, "None, not 2 sequences"),
+        (torch.zeros(2, 3), r"float32 \[2, 3\], not 2 sequences"),
+        ([], "0 of them, not 2 sequences"),
+        ([("left",)] * 3, "3 of them, not 2 sequences"),
+        (["left", "left"], "'left', not a sequence of actions"),
+        ([("left",), 3], "3, not a sequence of actions"),
+        ([("left",) * 5, ()], "5 actions of at most 4"),
+        ([("left",), ("fly",)], "the action 'fly'; known: forward, left"),
+    ],
+)
+def test_proposals_that_no_policy_promises_name_the_policy(proposed, cause):
+    with pytest.raises(PluginError, match=f"^policy 'mine': propose gave {cause}"):
+        check_proposals(proposed, "mine", ("forward", "left"), 4, 2)
+
+
+@pytest.mark.parametrize(
+    "costs", [None, [[0.1]], torch.zeros(3), torch.zeros(1, 3), torch.zeros(3, 2, dtype=torch.int)]
+)
+def test_costs_that_no_cost_promises_name_the_cost(costs):
+    with pytest.raises(PluginError, match=r"^cost 'far': measure gave .*, not float \[3, 2\]"):
+        check_costs(costs, "far", (3, 2))
