@@ -25,11 +25,11 @@ from persist_cli.api.ground import Body, Cover
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.observations import Frame, Observations, TrajectoryInfo
 from persist_cli.api.simulator import Simulator, random_ground
-from persist_cli.bench.true_scene import observations_of
 from persist_cli.checkpoints.lineage import training_scenes
 from persist_cli.checkpoints.load import adapter_memory, load_adapter, load_backbone
 from persist_cli.checkpoints.placement import check_placement
 from persist_cli.data.held_out import was_trained_on
+from persist_cli.episodes.true_scene import observations_of
 from persist_cli.errors import DataError
 from persist_cli.evaluate.statistics import Draws, Figure, make_figure
 from persist_cli.io.files import check_file, write_json

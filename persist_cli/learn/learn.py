@@ -23,12 +23,12 @@ from persist_cli.api.checkpoint import PLAIN, find_checkpoint, step_folders
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.api.simulator import Simulator
-from persist_cli.bench.episodes import Episode, EpisodeSet, read_episodes
-from persist_cli.bench.plan_bench import check_scenes, known_scenes
-from persist_cli.bench.run_episode import LoopSettings
+from persist_cli.bench.plans.plan_bench import check_scenes, known_scenes
 from persist_cli.checkpoints.placement import check_placement
 from persist_cli.checkpoints.retention import ended_recipe
 from persist_cli.data.store import write_trajectory
+from persist_cli.episodes.episodes import Episode, EpisodeSet, read_episodes
+from persist_cli.episodes.run_episode import LoopSettings
 from persist_cli.errors import DataError, PersistError
 from persist_cli.evaluate.journal import check_same
 from persist_cli.io.files import check_folder, file_sha256, read_json, write_json, write_text

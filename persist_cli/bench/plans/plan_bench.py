@@ -16,17 +16,17 @@ from persist_cli.api.cost import Cost
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.policy import Policy
 from persist_cli.api.simulator import Simulator
-from persist_cli.bench.episodes import Episode, EpisodeSet, read_episodes
-from persist_cli.bench.find_episodes import EpisodeSearch
-from persist_cli.bench.make_episodes import draw_episodes
-from persist_cli.bench.navigator import Navigator, PlanSettings, RowParts
-from persist_cli.bench.planning_journal import PlanningJournal, check_row_folders
-from persist_cli.bench.rows import ALONE, NO_MEMORY, PlanningRow, RowChoice, default_rows
-from persist_cli.bench.run_episode import LoopSettings, run_closed_loop, run_open_loop
-from persist_cli.bench.stop_rules import StopAtPlace, StopByCost, StopRule, StopThresholds, stop_thresholds
-from persist_cli.bench.true_scene import TrueScene
+from persist_cli.bench.plans.journal import PlanningJournal, check_row_folders
 from persist_cli.checkpoints.load import adapter_memory, empty_backbone, load_adapter
 from persist_cli.checkpoints.placement import check_placement
+from persist_cli.episodes.episodes import Episode, EpisodeSet, read_episodes
+from persist_cli.episodes.find_episodes import EpisodeSearch
+from persist_cli.episodes.make_episodes import draw_episodes
+from persist_cli.episodes.navigator import Navigator, PlanSettings, RowParts
+from persist_cli.episodes.rows import ALONE, NO_MEMORY, PlanningRow, RowChoice, default_rows
+from persist_cli.episodes.run_episode import LoopSettings, run_closed_loop, run_open_loop
+from persist_cli.episodes.stop_rules import StopAtPlace, StopByCost, StopRule, StopThresholds, stop_thresholds
+from persist_cli.episodes.true_scene import TrueScene
 from persist_cli.errors import DataError, PersistError, hint
 from persist_cli.evaluate.backbones import BackboneLoader
 from persist_cli.evaluate.journal import Processes
