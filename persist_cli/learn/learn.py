@@ -23,7 +23,7 @@ from persist_cli.api.checkpoint import PLAIN, find_checkpoint, step_folders
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.api.simulator import Simulator
-from persist_cli.bench.plans.plan_bench import check_scenes, known_scenes
+from persist_cli.checkpoints.contamination import refuse_training_episodes
 from persist_cli.checkpoints.placement import check_placement
 from persist_cli.checkpoints.retention import ended_recipe
 from persist_cli.data.store import write_trajectory
@@ -257,7 +257,7 @@ def check_horizon(plan: LearnPlan, begin: TrainedPolicy) -> None:
 def check_held_out(plan: LearnPlan, begin: TrainedPolicy, scene: str) -> None:
     """Raise ``DataError`` when model or policy were trained on the evaluated scene, unless that is allowed."""
     checkpoint = find_checkpoint(plan.checkpoint) if plan.inside == MODEL else None
-    check_scenes([scene], known_scenes(checkpoint, begin), plan.allow_training_scenes)
+    refuse_training_episodes([scene], checkpoint, begin, plan.allow_training_scenes)
 
 
 def episodes_of(file: Path, info: TrajectoryInfo, simulator: Simulator) -> list[Episode]:

@@ -12,16 +12,14 @@ from typing import Any
 
 import pytest
 
-from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.policy import Policy
 from persist_cli.bench.plans.journal import check_row_folders
 from persist_cli.bench.plans.pictures import end_words
-from persist_cli.bench.plans.plan_bench import EpisodeSource, check_scenes, known_scenes, trained_policy
+from persist_cli.bench.plans.plan_bench import EpisodeSource
 from persist_cli.episodes.episodes import EpisodeSet
 from persist_cli.episodes.rows import PlanningRow
 from persist_cli.errors import DataError
 from persist_cli.metrics.lpips import ALEX, tensor_shapes
-from persist_cli.plugins import make_policy
 from persist_cli.policies.open_policy import open_policy
 from tests.conftest import CommandResult, Persist
 from tests.support.micro_runs import run_persist
@@ -380,16 +378,6 @@ def test_episodes_of_another_image_size_are_refused(
     assert "--size 32x32" in ended.err
 
 
-def test_scenes_that_the_model_was_trained_on_are_refused(episodes: EpisodeSet, voxel: Path) -> None:
-    trained = known_scenes(find_checkpoint(voxel), policy=None)
-    room = episodes.episodes[0].model_copy(update={"scene_name": "room-0"})
-    known = episodes.model_copy(update={"episodes": [room]})
-    with pytest.raises(DataError, match="'room-0': the model was trained on it"):
-        check_scenes(known.scenes, trained, allowed=False)
-    check_scenes(known.scenes, trained, allowed=True)
-    check_scenes(episodes.scenes, trained, allowed=False)
-
-
 def test_a_trained_policy_acts_alone_and_proposes_what_is_ranked(
     bench: Bench, policy_run: Path, random_lpips: None
 ) -> None:
@@ -399,14 +387,6 @@ def test_a_trained_policy_acts_alone_and_proposes_what_is_ranked(
     rows = json.loads(ended.out)["tables"][0]["rows"]
     assert list(rows) == ["policy", "rank-2, simulator"]
     assert set(rows["rank-2, simulator"]["success"]["differences"]) == {"policy"}
-
-
-def test_scenes_that_the_policy_was_trained_on_are_refused(episodes: EpisodeSet, policy_run: Path) -> None:
-    room = episodes.episodes[0].model_copy(update={"scene_name": "room-1"})
-    known = episodes.model_copy(update={"episodes": [room]})
-    with pytest.raises(DataError, match=r"'room-1': policy .* was trained on it"):
-        check_scenes(known.scenes, known_scenes(None, trained_policy(open_policy(str(policy_run)))), allowed=False)
-    assert known_scenes(None, trained_policy(make_policy("random", {}))) == {}
 
 
 def test_a_policy_that_does_not_look_so_far_is_refused(bench: Bench, policy_run: Path, random_lpips: None) -> None:
