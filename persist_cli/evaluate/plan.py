@@ -19,9 +19,10 @@ from persist_cli.data.cameras import unfamiliar_view
 from persist_cli.errors import PersistError, hint
 from persist_cli.evaluate.backbones import BackboneLoader, check_bases, common_sampling
 from persist_cli.evaluate.cases import Case
-from persist_cli.evaluate.journal import Journal, Processes, Unit
+from persist_cli.evaluate.journal import Journal, Unit
 from persist_cli.evaluate.metric_suite import MetricSuite, choose_metrics, make_setup
 from persist_cli.evaluate.new_poses import NEW_POSES, NewPoses
+from persist_cli.evaluate.processes import Processes
 from persist_cli.evaluate.protocols import PROTOCOLS, ClipSearch, Protocol
 from persist_cli.evaluate.provenance import (
     checkpoint_json,

@@ -30,7 +30,7 @@ from persist_cli.data.store import write_trajectory
 from persist_cli.episodes.episodes import Episode, EpisodeSet, read_episodes
 from persist_cli.episodes.run_episode import LoopSettings
 from persist_cli.errors import DataError, PersistError
-from persist_cli.evaluate.journal import check_same
+from persist_cli.io.begun_with import check_same
 from persist_cli.io.files import check_folder, file_sha256, read_json, write_json, write_text
 from persist_cli.io.settings import parse_settings
 from persist_cli.learn.evaluation import STOP_COST, evaluate_policy, mean_figures, stop_rule

@@ -30,7 +30,7 @@ from persist_cli.episodes.stop_rules import StopAtPlace, StopByCost, StopRule, S
 from persist_cli.episodes.true_scene import TrueScene
 from persist_cli.errors import DataError, PersistError, hint
 from persist_cli.evaluate.backbones import BackboneLoader
-from persist_cli.evaluate.journal import Processes
+from persist_cli.evaluate.processes import Processes
 from persist_cli.evaluate.provenance import checkpoint_json
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.metrics.src import chosen_encoder
