@@ -30,7 +30,7 @@ from persist_cli.bench.scenes.completions import (
     Truth,
 )
 from persist_cli.bench.scenes.interactions import Event, find_events
-from persist_cli.bench.scenes.scene_journal import SceneJournal
+from persist_cli.bench.scenes.journal import SceneJournal
 from persist_cli.bench.scenes.training_houses import House, read_houses
 from persist_cli.bench.scenes.views import Region, View, near_camera, same_form, true_region
 from persist_cli.checkpoints.contamination import ALLOW, OTHER_DATA, ShownScene, known_names, refuse_training_scenes
