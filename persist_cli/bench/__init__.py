@@ -1,1 +1,1 @@
-"""Benchmarks of plans and collisions against a simulator's own truth."""
+"""Benchmarks of plans, collisions and imagined scenes against a simulator's own truth."""

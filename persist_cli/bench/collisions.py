@@ -25,11 +25,10 @@ from persist_cli.api.ground import Body, Cover
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.observations import Frame, Observations, TrajectoryInfo
 from persist_cli.api.simulator import Simulator, random_ground
-from persist_cli.bench.true_scene import observations_of
-from persist_cli.checkpoints.lineage import training_scenes
+from persist_cli.checkpoints.contamination import ShownScene, refuse_training_scenes, scenes_to_avoid
 from persist_cli.checkpoints.load import adapter_memory, load_adapter, load_backbone
 from persist_cli.checkpoints.placement import check_placement
-from persist_cli.data.held_out import was_trained_on
+from persist_cli.episodes.true_scene import observations_of
 from persist_cli.errors import DataError
 from persist_cli.evaluate.statistics import Draws, Figure, make_figure
 from persist_cli.io.files import check_file, write_json
@@ -165,14 +164,13 @@ def walk_houses(plan: CollisionPlan, size: tuple[int, int], checkpoint: Checkpoi
         DataError: when the model was trained on one of the scenes.
     """
     simulator = make_simulator(plan.scenes.simulator, {"height": size[0], "width": size[1]})
-    known, seeds = training_scenes(checkpoint).names, plan.scenes.generator_seeds
+    known, seeds = scenes_to_avoid([checkpoint]), plan.scenes.generator_seeds
     houses = []
     with progress() as bar:
         task = add_task(bar, "walking in the simulator", len(seeds), "scenes")
         for seed in seeds:
             simulator.open_scene(seed)
-            if was_trained_on(simulator.info, known):
-                raise DataError(f"{simulator.info.scene}: the model was trained on it; take other --scenes or --split")
+            refuse_training_scenes([ShownScene(simulator.info.scene)], known, "take other --scenes or --split")
             generators = [np.random.default_rng([plan.scenes.seed, seed, number]) for number in range(plan.walks)]
             houses.append([random_walk(simulator, generator, plan.actions) for generator in generators])
             bar.advance(task)

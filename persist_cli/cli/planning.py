@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -30,6 +30,9 @@ from persist_cli.cli.options import (
     split_names,
 )
 from persist_cli.errors import PersistError
+
+if TYPE_CHECKING:
+    from persist_cli.bench.plans.plan_bench import EpisodeSource
 
 PLAN_MEMORIES = "none,voxel,simulator"
 
@@ -159,7 +162,7 @@ def learn(
 
     persist learn --views sample#0:0-24 --policy runs/policy --out runs/learn
     """
-    from persist_cli.bench.run_episode import LoopSettings
+    from persist_cli.episodes.run_episode import LoopSettings
     from persist_cli.learn.learn import LearnPlan, run_learn
     from persist_cli.learn.practice import PracticeSettings
 
@@ -197,8 +200,8 @@ def bench_episodes(
 
     persist bench episodes --scenes 0:48 --each 24 --out runs/episodes.json
     """
-    from persist_cli.bench.find_episodes import EpisodeSearch
-    from persist_cli.bench.make_episodes import run_episodes
+    from persist_cli.episodes.find_episodes import EpisodeSearch
+    from persist_cli.episodes.make_episodes import run_episodes
     from persist_cli.simulators.collect import CollectPlan
 
     search = EpisodeSearch(whole_numbers("--bins", bins), each, walk_frames, seed, per_scene, goal_gap, goals)
@@ -238,6 +241,13 @@ def bench_collisions(
         InferenceOptions.of(dtype, save_memory),
     )  # fmt: skip
     run_collisions(checkpoint, plan, out, json)
+
+
+def episode_source(file: Path | None, scenes: str | None, bins: str | None, each: int | None) -> EpisodeSource:
+    """Return where the episodes of `bench plan` come from, by its options."""
+    from persist_cli.bench.plans.plan_bench import EpisodeSource
+
+    return EpisodeSource.of(file, scenes, whole_numbers("--bins", bins) if bins else None, each)
 
 
 @bench_app.command("plan")
@@ -282,15 +292,15 @@ def bench_plan(
 
     persist bench plan --scenes 0:24 --rows random,rank-8 --memories none,voxel --report runs/plans
     """
-    from persist_cli.bench import navigator, plan_bench, run_episode, run_plan_bench
+    from persist_cli.bench.plans import plan_bench, run_plan_bench
+    from persist_cli.episodes import navigator, run_episode
 
     run_plan_bench.run_plan_bench(plan_bench.BenchPlan(
-        plan_bench.EpisodeSource.of(episodes, scenes, whole_numbers("--bins", bins) if bins else None, each),
-        checkpoint, split_names(rows) if rows else None, split_names(memories), policy, cost, navigator.PlanSettings(
-            horizon, over, frames, seconds, body, keep, approach, explore).of_cem(settings, candidates, rounds),
-        split_names(loops), run_episode.LoopSettings(execute, patience, max_actions=max_actions), stop_cost,
-        SamplingOverrides(steps, sampler, guidance), InferenceOptions.of(dtype, save_memory), allow_training_scenes,
-    ), out, report, json)  # fmt: skip
+        episode_source(episodes, scenes, bins, each), checkpoint, split_names(rows) if rows else None,
+        split_names(memories), policy, cost, navigator.PlanSettings(horizon, over, frames, seconds, body, keep,
+            approach, explore).of_cem(settings, candidates, rounds), split_names(loops), run_episode.LoopSettings(
+            execute, patience, max_actions=max_actions), stop_cost, SamplingOverrides(steps, sampler, guidance),
+        InferenceOptions.of(dtype, save_memory), allow_training_scenes), out, report, json)  # fmt: skip
 
 
 @bench_app.command("scene")

@@ -29,11 +29,22 @@ def was_trained_on(info: TrajectoryInfo, names: Collection[str], first: int = 0)
 
     Args:
         info: of the trajectory that shows the scene.
-        names: names of ``trained_scene``. A part without a sequence, as earlier versions named them, is one of each.
+        names: names of ``trained_scene``.
         first: number of the first frame that matters.
     """
-    rests = [name.removeprefix(info.scene) for name in names if name.startswith(info.scene)]
+    return scene_was_trained_on(info.scene, names, first, info.source.get(SEQUENCE))
+
+
+def scene_was_trained_on(scene: str, names: Collection[str], first: int = 0, sequence: str | None = None) -> bool:
+    """Whether a model was trained on frames of a scene from a number on.
+
+    Args:
+        scene: its name.
+        names: names of ``trained_scene``. A part without a sequence, as earlier versions named them, is one of each.
+        first: number of the first frame that matters.
+        sequence: which of the scene's sequences matters; ``None`` for any.
+    """
+    rests = [name.removeprefix(scene) for name in names if name.startswith(scene)]
     parts = [part for rest in rests if (part := PART.fullmatch(rest))]
-    sequence = info.source.get(SEQUENCE)
     own = [part for part in parts if None in (sequence, part["sequence"]) or part["sequence"] == sequence]
-    return info.scene in names or any(int(part["end"]) > first for part in own)
+    return scene in names or any(int(part["end"]) > first for part in own)

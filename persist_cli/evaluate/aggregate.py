@@ -16,7 +16,7 @@ from persist_cli.evaluate.columns import Column, chosen_frames, make_columns, wi
 from persist_cli.evaluate.journal import TRUTH
 from persist_cli.evaluate.metric_suite import CELLS, FEATURES, FIGURES, READS, WEIGHTS, MetricSuite, make_setup
 from persist_cli.evaluate.plan import Evaluation
-from persist_cli.evaluate.provenance import scenes_of
+from persist_cli.evaluate.provenance import shown_scenes
 from persist_cli.evaluate.rows.row import Row
 from persist_cli.evaluate.rows.training_seeds import training_of
 from persist_cli.evaluate.statistics import (
@@ -173,7 +173,7 @@ class Table:
     @property
     def scenes(self) -> int:
         """Number of different scenes that the clips show."""
-        return len(scenes_of(self.cases))
+        return len(shown_scenes(self.cases))
 
     def draws(self, results: RowResults, count: int = RESAMPLES) -> Draws:
         """The bootstrap samples of a row."""

@@ -15,10 +15,10 @@ from persist_cli.evaluate.aggregate import Table, row_results
 from persist_cli.evaluate.cases import Case, cases_json, counts
 from persist_cli.evaluate.columns import column_json, make_columns
 from persist_cli.evaluate.example_clips import make_pictures
-from persist_cli.evaluate.journal import Processes
 from persist_cli.evaluate.measure import measure_rows
 from persist_cli.evaluate.metric_suite import CELLS
 from persist_cli.evaluate.plan import EvalPlan, Evaluation, contamination_warnings, prepare
+from persist_cli.evaluate.processes import Processes
 from persist_cli.evaluate.provenance import checkpoint_json, environment, metric_json, scenes_json
 from persist_cli.evaluate.report.page import PAGE, write_report
 from persist_cli.evaluate.report.result_file import check_results

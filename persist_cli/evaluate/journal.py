@@ -5,17 +5,16 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 import torch
-from accelerate import PartialState
 from torch import Tensor
 
 from persist_cli.data.store import SUFFIX
-from persist_cli.errors import DataError, PersistError
+from persist_cli.errors import DataError
 from persist_cli.evaluate.cases import Case, hash_trajectories
+from persist_cli.io.begun_with import check_same
 from persist_cli.io.files import file_sha256, read_json, read_tensors, remove_leftovers, write_json, write_tensors
 
 FOLDER = "parts"
@@ -23,8 +22,6 @@ FOLDER = "parts"
 PLAN, CASES, DATA, ROWS = "plan.json", "cases.json", "data.json", "rows.json"
 
 TRUTH = -1  # stands for the true videos where a row's number is expected
-
-LONGEST_WAIT = timedelta(days=7)  # of a process for the slowest one
 
 
 @dataclass(frozen=True)
@@ -139,66 +136,3 @@ class Journal:
     def gather(self, row: int, seed: int, batches: int, name: str) -> Tensor:
         """A tensor of every clip of a measured row at a seed, its batches one after the other."""
         return torch.cat([self.read(Unit(row, seed, batch))[name] for batch in range(batches)])
-
-
-class Processes:
-    """This process among those of ``accelerate launch`` that share an evaluation; without it there is one."""
-
-    def __init__(self) -> None:
-        self.state = PartialState(cpu=not torch.cuda.is_available(), timeout=LONGEST_WAIT)
-
-    @property
-    def count(self) -> int:
-        """Number of processes."""
-        return int(self.state.num_processes)
-
-    @property
-    def main(self) -> bool:
-        """Whether this process is the one that finds the clips and writes the results."""
-        return bool(self.state.is_main_process)
-
-    def owns(self, batch: int) -> bool:
-        """Whether this process measures a batch; batches are equal for any number of processes."""
-        return batch % self.count == int(self.state.process_index)
-
-    def wait(self) -> None:
-        """Wait until every process is here."""
-        self.state.wait_for_everyone()
-
-
-def check_same(earlier: Any, now: Any, refusal: str) -> None:
-    """Raise ``PersistError`` when a folder was begun with other values than those of now.
-
-    A checkpoint that was moved is the same one: where a fingerprint stands, the path beside it does not count.
-
-    Args:
-        earlier: JSON values that the folder holds.
-        now: JSON values.
-        refusal: the beginning of the error's line.
-    """
-    earlier, now = _wherever_it_lies(earlier), _wherever_it_lies(now)
-    if earlier != now:
-        raise PersistError(f"{refusal} ({first_difference(earlier, now)}); choose another --out or delete it")
-
-
-def _wherever_it_lies(values: Any) -> Any:
-    """Return JSON values without the paths of what a fingerprint names."""
-    if isinstance(values, dict):
-        return {
-            key: _wherever_it_lies(value)
-            for key, value in values.items()
-            if not (key == "path" and "fingerprint" in values)
-        }
-    return [_wherever_it_lies(value) for value in values] if isinstance(values, list) else values
-
-
-def first_difference(earlier: Any, new: Any, where: str = "") -> str:
-    """The first key that two plans differ in, with both values."""
-    if isinstance(earlier, dict) and isinstance(new, dict):
-        key = next(key for key in sorted({*earlier, *new}) if earlier.get(key) != new.get(key))
-        return first_difference(earlier.get(key), new.get(key), f"{where} {key}".strip())
-    pairs = list(zip(earlier, new, strict=False)) if isinstance(earlier, list) and isinstance(new, list) else []
-    if pairs and isinstance(pairs[0][0], dict) and len(earlier) == len(new):
-        place = next(place for place, (one, two) in enumerate(pairs) if one != two)
-        return first_difference(*pairs[place], f"{where} {place}")
-    return f"{where}: {earlier}, now {new}"

@@ -11,9 +11,10 @@ from torch import Tensor
 from persist_cli.api.backbone import Backbone
 from persist_cli.evaluate.backbones import BackboneLoader
 from persist_cli.evaluate.cases import CaseFrames, read_case
-from persist_cli.evaluate.journal import TRUTH, Processes, Unit
+from persist_cli.evaluate.journal import TRUTH, Unit
 from persist_cli.evaluate.metric_suite import CELLS, READS, VIDEO
 from persist_cli.evaluate.plan import Evaluation
+from persist_cli.evaluate.processes import Processes
 from persist_cli.evaluate.rows.row import Row
 from persist_cli.rollout.world_model import clip_seed
 from persist_cli.viewing.console import add_task, busy, progress

@@ -12,23 +12,24 @@ from typing import Any
 from persist_cli.api.backbone import Sampling
 from persist_cli.api.checkpoint import Checkpoint, find_checkpoint
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
-from persist_cli.checkpoints import lineage
+from persist_cli.checkpoints.contamination import ALLOW, OTHER_DATA, scenes_to_avoid
+from persist_cli.checkpoints.lineage import training_scenes
 from persist_cli.checkpoints.placement import check_placement
 from persist_cli.data.cameras import unfamiliar_view
 from persist_cli.errors import PersistError, hint
 from persist_cli.evaluate.backbones import BackboneLoader, check_bases, common_sampling
 from persist_cli.evaluate.cases import Case
-from persist_cli.evaluate.journal import Journal, Processes, Unit
+from persist_cli.evaluate.journal import Journal, Unit
 from persist_cli.evaluate.metric_suite import MetricSuite, choose_metrics, make_setup
 from persist_cli.evaluate.new_poses import NEW_POSES, NewPoses
+from persist_cli.evaluate.processes import Processes
 from persist_cli.evaluate.protocols import PROTOCOLS, ClipSearch, Protocol
 from persist_cli.evaluate.provenance import (
     checkpoint_json,
     metric_json,
     scene_models,
-    scenes_of,
+    shown_scenes,
     trained_on,
-    training_scenes,
 )
 from persist_cli.evaluate.report.remarks import contamination
 from persist_cli.evaluate.rows.build_rows import (
@@ -44,8 +45,6 @@ from persist_cli.evaluate.statistics import RESAMPLE_UNITS
 from persist_cli.metrics import METRICS
 from persist_cli.metrics.metric import Metric
 from persist_cli.viewing.console import busy, warn
-
-ALLOW = "take data of another split, or measure it all the same with --allow-training-scenes"
 
 
 @dataclass(frozen=True)
@@ -157,14 +156,14 @@ def prepare(
         bases = check_bases(checkpoints, plan.data, [sampling, *config.sampling_of.values()], loader)
     models = build_model_rows(checkpoints, config, protocol)  # unknown memories are reported before clips are sought
     search = ClipSearch(
-        plan.data, plan.frames, plan.clips, bases.frames_per_clip - 1, training_scenes(checkpoints), plan.new_poses
+        plan.data, plan.frames, plan.clips, bases.frames_per_clip - 1, scenes_to_avoid(checkpoints), plan.new_poses
     )
     journal = Journal(out)
     if processes.main:
         values = identity(plan, sampling, checkpoints, metrics)
         journal.check(values)
         if not plan.allow_training_scenes:
-            protocol.refuse_training_scenes(search, ALLOW)
+            protocol.check_scenes(search, f"{OTHER_DATA}, or {ALLOW}")
         check_row_numbers(journal, checkpoints, plan.memories or ())
         if journal.cases() is None:
             cases = find_cases(protocol, search)
@@ -234,14 +233,14 @@ def warn_of_clips(cases: Sequence[Case], checkpoints: Sequence[Checkpoint], sear
     for line in contamination_warnings(checkpoints, cases):
         warn(f"warning: {line}")
     for checkpoint in checkpoints:
-        view = unfamiliar_view((file.info for file in search.trajectories()), lineage.training_scenes(checkpoint))
+        view = unfamiliar_view((file.info for file in search.trajectories()), training_scenes(checkpoint))
         if view is not None:
             warn(f"warning: {checkpoint.folder}: {view}")
 
 
 def contamination_warnings(checkpoints: Sequence[Checkpoint], cases: Sequence[Case]) -> list[str]:
     """A line for each checkpoint that is known to have been trained on scenes of the cases."""
-    scenes = scenes_of(cases)
+    scenes = shown_scenes(cases)
     known = [(str(checkpoint.folder), trained_on(checkpoint, cases)) for checkpoint in checkpoints]
     return [contamination(folder, names, len(scenes), allowed=True) for folder, names in known if names]
 

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from persist_cli.api.geometry import pose_differences
 from persist_cli.api.observations import Observations
-from persist_cli.data.held_out import HELD_OUT_FROM, was_trained_on
+from persist_cli.checkpoints.contamination import OTHER_DATA, ShownScene, refuse_training_scenes
+from persist_cli.data.held_out import HELD_OUT_FROM
 from persist_cli.data.store import Store, TrajectoryFile
 from persist_cli.errors import DataError
 from persist_cli.evaluate.cases import Case
@@ -111,16 +112,15 @@ class Protocol(ABC):
         """The number of the first frame of a trajectory that may be predicted."""
         return 0
 
-    def refuse_training_scenes(self, search: ClipSearch, way_out: str = "take data of another split") -> None:
+    def check_scenes(self, search: ClipSearch, way_out: str = OTHER_DATA) -> None:
         """Raise ``DataError`` when a model was trained on what a data set shows from its first scored frame on.
 
         Args:
             search: names the data sets and the training scenes.
             way_out: what the user may do, the end of the message.
         """
-        for file in search.trajectories():
-            if was_trained_on(file.info, search.training_scenes, self.first_scored(file)):
-                raise DataError(f"{file.path}: the model was trained on its scene {file.info.scene!r}; {way_out}")
+        shown = (ShownScene.of(file, self.first_scored(file)) for file in search.trajectories())
+        refuse_training_scenes(shown, search.training_scenes, way_out)
 
     def make_case(
         self, file: TrajectoryFile, seen: Observations, where: tuple[int, int, int], search: ClipSearch
@@ -220,16 +220,16 @@ class Unseen(Revisit):
     )
     domains = True
 
-    def refuse_training_scenes(self, search: ClipSearch, way_out: str = "") -> None:
+    def check_scenes(self, search: ClipSearch, way_out: str = "") -> None:
         """Raise ``DataError`` when a model was trained on a scene; there is no way out but other data."""
-        super().refuse_training_scenes(search)
+        super().check_scenes(search)
 
     def find(self, search: ClipSearch) -> list[Case]:
         """Find the clips of each data set, up to the limit in each."""
         for file in search.trajectories():
             if file.info.source.get("split") == "train":
                 raise DataError(f"{file.path}: its scene is of the training split; collect with --split test")
-        self.refuse_training_scenes(search)
+        self.check_scenes(search)
         cases: list[Case] = []
         for folder in search.folders:
             cases += super().find(dataclasses.replace(search, folders=[folder]))

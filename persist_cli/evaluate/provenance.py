@@ -21,7 +21,6 @@ from persist_cli.io.files import file_sha256, read_json
 from persist_cli.io.hub import cached_weight
 from persist_cli.memorize.imagining import scene_model_fingerprint
 from persist_cli.metrics.metric import Metric
-from persist_cli.viewing.console import warn
 
 PACKAGES = ("accelerate", "diffusers", "numpy", "safetensors", "scipy", "torch", "torchmetrics", "transformers")
 
@@ -79,7 +78,7 @@ def scenes_json(checkpoint: Checkpoint, cases: Sequence[Case] = ()) -> dict[str,
     }
 
 
-def scenes_of(cases: Sequence[Case]) -> frozenset[str]:
+def shown_scenes(cases: Sequence[Case]) -> frozenset[str]:
     """Names of the scenes that the cases show."""
     return frozenset(case.scene for case in cases)
 
@@ -109,18 +108,6 @@ def recipe_sha256(folder: Path) -> str | None:
     for name, text in sorted(texts.items()):
         digest.update(name.encode() + b"\0" + hashlib.sha256(text).digest())
     return digest.hexdigest() if texts else None
-
-
-def training_scenes(checkpoints: Sequence[Checkpoint]) -> frozenset[str]:
-    """Names of the scenes that the checkpoints were trained on, with a warning where not all of them are known."""
-    names: frozenset[str] = frozenset()
-    for checkpoint in checkpoints:
-        scenes = lineage.training_scenes(checkpoint)
-        names |= scenes.names
-        if not scenes.complete:
-            count = f" ({len(scenes.names)} are)" if scenes.names else ""
-            warn(f"{checkpoint.folder}: not all scenes that it was trained on are known{count}")
-    return names
 
 
 def metric_json(metrics: Mapping[str, Metric]) -> dict[str, Any]:

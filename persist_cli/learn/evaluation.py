@@ -11,12 +11,12 @@ import torch
 from persist_cli.api.observations import Observations
 from persist_cli.api.policy import Goal, Policy
 from persist_cli.api.simulator import Simulator
-from persist_cli.bench.episodes import Episode
-from persist_cli.bench.navigator import Navigator, PlanSettings, RowParts
-from persist_cli.bench.rows import PlanningRow
-from persist_cli.bench.run_episode import LoopSettings, run_closed_loop
-from persist_cli.bench.stop_rules import StopByCost, StopRule
-from persist_cli.bench.true_scene import TrueScene
+from persist_cli.episodes.episodes import Episode
+from persist_cli.episodes.navigator import Navigator, PlanSettings, RowParts
+from persist_cli.episodes.rows import PlanningRow
+from persist_cli.episodes.run_episode import LoopSettings, run_closed_loop
+from persist_cli.episodes.stop_rules import StopByCost, StopRule
+from persist_cli.episodes.true_scene import TrueScene
 from persist_cli.errors import PersistError
 from persist_cli.plugins import make_cost
 from persist_cli.viewing.console import watched

@@ -23,14 +23,14 @@ from persist_cli.api.checkpoint import PLAIN, find_checkpoint, step_folders
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.api.simulator import Simulator
-from persist_cli.bench.episodes import Episode, EpisodeSet, read_episodes
-from persist_cli.bench.plan_bench import check_scenes, known_scenes
-from persist_cli.bench.run_episode import LoopSettings
+from persist_cli.checkpoints.contamination import refuse_training_episodes
 from persist_cli.checkpoints.placement import check_placement
 from persist_cli.checkpoints.retention import ended_recipe
 from persist_cli.data.store import write_trajectory
+from persist_cli.episodes.episodes import Episode, EpisodeSet, read_episodes
+from persist_cli.episodes.run_episode import LoopSettings
 from persist_cli.errors import DataError, PersistError
-from persist_cli.evaluate.journal import check_same
+from persist_cli.io.begun_with import check_same
 from persist_cli.io.files import check_folder, file_sha256, read_json, write_json, write_text
 from persist_cli.io.settings import parse_settings
 from persist_cli.learn.evaluation import STOP_COST, evaluate_policy, mean_figures, stop_rule
@@ -257,7 +257,7 @@ def check_horizon(plan: LearnPlan, begin: TrainedPolicy) -> None:
 def check_held_out(plan: LearnPlan, begin: TrainedPolicy, scene: str) -> None:
     """Raise ``DataError`` when model or policy were trained on the evaluated scene, unless that is allowed."""
     checkpoint = find_checkpoint(plan.checkpoint) if plan.inside == MODEL else None
-    check_scenes([scene], known_scenes(checkpoint, begin), plan.allow_training_scenes)
+    refuse_training_episodes([scene], checkpoint, begin, plan.allow_training_scenes)
 
 
 def episodes_of(file: Path, info: TrajectoryInfo, simulator: Simulator) -> list[Episode]:

@@ -11,7 +11,7 @@ import torch
 from persist_cli.api.ground import Body
 from persist_cli.api.observations import Frame, Observations, TrajectoryInfo
 from persist_cli.api.simulator import Simulator
-from persist_cli.bench.true_scene import observations_of
+from persist_cli.episodes.true_scene import observations_of
 from persist_cli.errors import DataError
 from persist_cli.navigation.ground_mapper import body_of
 from persist_cli.rollout.world_model import Agent, StepResult, WorldModel

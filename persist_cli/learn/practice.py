@@ -20,7 +20,7 @@ from pydantic import Field
 from persist_cli.api.ground import Body, GroundMap
 from persist_cli.api.observations import Frame, Observations, TrajectoryInfo
 from persist_cli.api.policy import Goal, Policy, Situation
-from persist_cli.bench.stop_rules import AT_PLACE
+from persist_cli.episodes.stop_rules import AT_PLACE
 from persist_cli.learn.places import PracticePlace
 from persist_cli.navigation.ground_mapper import GroundMapper
 from persist_cli.planning.futures import PoseFutures

@@ -20,9 +20,9 @@ from typing import Any, Final
 import numpy as np
 
 from persist_cli.api.checkpoint import PLAIN, SHOWN, find_checkpoint
-from persist_cli.bench.episodes import read_episodes
-from persist_cli.bench.rows import NO_MEMORY
 from persist_cli.data.store import Store
+from persist_cli.episodes.episodes import read_episodes
+from persist_cli.episodes.rows import NO_MEMORY
 from persist_cli.errors import PersistError
 from persist_cli.evaluate.statistics import LEAST_UNITS, Draws, Figure, difference, mean_figure
 from persist_cli.io.files import read_json, write_json, write_text

@@ -8,8 +8,8 @@ from typing import Any, Final
 
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.errors import PersistError
-from persist_cli.evaluate.journal import check_same
 from persist_cli.evaluate.provenance import checkpoint_json
+from persist_cli.io.begun_with import check_same
 from persist_cli.io.files import plain, read_json, write_json
 
 PLAN: Final = "plan.json"

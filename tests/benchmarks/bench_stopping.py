@@ -32,12 +32,12 @@ from persist_cli.api.ground import GroundMap
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.api.policy import Goal, Situation
 from persist_cli.api.simulator import Simulator
-from persist_cli.bench.episodes import Episode, EpisodeSet, read_episodes
-from persist_cli.bench.navigation_metrics import SUCCESS_METRES
-from persist_cli.bench.navigator import Navigator, PlanSettings, RowParts
-from persist_cli.bench.run_episode import ClosedLoop, LoopSettings, Trace
-from persist_cli.bench.stop_rules import view_costs
-from persist_cli.bench.true_scene import TrueScene
+from persist_cli.episodes.episodes import Episode, EpisodeSet, read_episodes
+from persist_cli.episodes.navigation_metrics import SUCCESS_METRES
+from persist_cli.episodes.navigator import Navigator, PlanSettings, RowParts
+from persist_cli.episodes.run_episode import ClosedLoop, LoopSettings, Trace
+from persist_cli.episodes.stop_rules import view_costs
+from persist_cli.episodes.true_scene import TrueScene
 from persist_cli.learn.evaluation import ROW
 from persist_cli.plugins import make_cost, make_simulator
 from persist_cli.policies.nomad.policy import STOP, NomadPolicy

@@ -8,10 +8,10 @@ import shutil
 import pytest
 
 from persist_cli.api.checkpoint import TrainingScenes, find_checkpoint
+from persist_cli.checkpoints.contamination import scenes_to_avoid
 from persist_cli.checkpoints.lineage import chosen_on, stage_recipes, training_scenes
 from persist_cli.checkpoints.scene_models import find_scene_model, write_scene_card
 from persist_cli.evaluate.provenance import checkpoint_json, scenes_json
-from persist_cli.evaluate.provenance import training_scenes as scenes_to_avoid
 from tests.support.damage import without_sums
 from tests.support.export_runs import write_runs
 from tests.support.micro_runs import stage

@@ -202,13 +202,13 @@ def test_later_clips_are_of_held_out_frames_and_remember_all_before(capture):
     cases = PROTOCOLS["later"].find(search(capture, 5))
     assert [case.start for case in cases] == [12, 14, 16, 18]
     assert all(case.context == case.start + 1 for case in cases)
-    PROTOCOLS["later"].refuse_training_scenes(search(capture, 5, ["room before frame 12"]))
+    PROTOCOLS["later"].check_scenes(search(capture, 5, ["room before frame 12"]))
 
 
 @pytest.mark.parametrize("scene", ["room", "room before frame 13"])
 def test_later_clips_are_refused_to_a_model_that_was_trained_on_them(capture, scene):
     with pytest.raises(DataError, match="the model was trained on its scene 'room'"):
-        PROTOCOLS["later"].refuse_training_scenes(search(capture, 5, [scene]))
+        PROTOCOLS["later"].check_scenes(search(capture, 5, [scene]))
 
 
 def test_a_capture_without_held_out_frames_or_with_few_has_no_later_clips(walks, capture):

@@ -19,9 +19,9 @@ from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.ground import Body
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.policy import Goal
-from persist_cli.bench.run_episode import LoopSettings
 from persist_cli.checkpoints.load import adapter_memory, load_backbone
 from persist_cli.data.store import Store, write_trajectory
+from persist_cli.episodes.run_episode import LoopSettings
 from persist_cli.learn.evaluation import mean_figures
 from persist_cli.learn.learn import FIGURES, LearnPlan, open_place, prepare, report
 from persist_cli.learn.places import ImaginedPlace

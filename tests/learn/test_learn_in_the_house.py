@@ -14,10 +14,10 @@ import pytest
 
 from persist_cli.api.checkpoint import CARD, TrainingScenes, find_checkpoint
 from persist_cli.api.observations import Frame
-from persist_cli.bench.episodes import EpisodeSet
-from persist_cli.bench.find_episodes import EpisodeSearch, find_episodes
-from persist_cli.bench.run_episode import run_closed_loop
 from persist_cli.data.store import Store, write_trajectory
+from persist_cli.episodes.episodes import EpisodeSet
+from persist_cli.episodes.find_episodes import EpisodeSearch, find_episodes
+from persist_cli.episodes.run_episode import run_closed_loop
 from persist_cli.errors import DataError
 from persist_cli.io.files import read_json, write_json
 from persist_cli.io.sha256sums import write_sums

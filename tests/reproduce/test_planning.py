@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from persist_cli.bench.rows import RowChoice
+from persist_cli.episodes.rows import RowChoice
 from persist_cli.errors import PersistError
 from persist_cli.reproduce.plan_file import keep_plan
 from persist_cli.reproduce.planning import PlanningFigures, commands, identity

@@ -10,11 +10,11 @@ from persist_cli.bench.scenes.completions import CEILINGS, SceneCompletion
 from persist_cli.bench.scenes.edit_part import edits_json, run_edits
 from persist_cli.bench.scenes.evolution_part import evolution_json, run_evolution
 from persist_cli.bench.scenes.plan_pictures import picture_views
+from persist_cli.bench.scenes.report import PAGE, write_scene_report
 from persist_cli.bench.scenes.return_part import return_json, run_returns
 from persist_cli.bench.scenes.scene_bench import SceneBench, SceneBenchPlan, identity, part_identities, prepare
-from persist_cli.bench.scenes.scene_report import PAGE, write_scene_report
-from persist_cli.bench.scenes.scene_tables import print_results, tables_text
 from persist_cli.bench.scenes.speed_part import run_speed, speed_json
+from persist_cli.bench.scenes.tables import print_results, tables_text
 from persist_cli.bench.scenes.walk_part import run_walks, walk_json
 from persist_cli.evaluate.provenance import environment
 from persist_cli.evaluate.statistics import LEAST_UNITS, RESAMPLES

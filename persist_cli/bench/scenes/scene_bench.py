@@ -30,11 +30,11 @@ from persist_cli.bench.scenes.completions import (
     Truth,
 )
 from persist_cli.bench.scenes.interactions import Event, find_events
-from persist_cli.bench.scenes.scene_journal import SceneJournal
+from persist_cli.bench.scenes.journal import SceneJournal
 from persist_cli.bench.scenes.training_houses import House, read_houses
 from persist_cli.bench.scenes.views import Region, View, near_camera, same_form, true_region
+from persist_cli.checkpoints.contamination import ALLOW, OTHER_DATA, ShownScene, known_names, refuse_training_scenes
 from persist_cli.checkpoints.scene_models import TrainedSceneModel, find_scene_model
-from persist_cli.data.held_out import was_trained_on
 from persist_cli.data.reference import parse_reference
 from persist_cli.data.store import Store, TrajectoryFile
 from persist_cli.errors import DataError, PersistError, hint
@@ -43,7 +43,7 @@ from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.memorize.memory_config import plugin_settings, scene_config
 from persist_cli.navigation.ground_mapper import body_of
 from persist_cli.recipe import MemoryConfig
-from persist_cli.viewing.console import add_task, progress, warn
+from persist_cli.viewing.console import add_task, progress
 
 WIDEST: Final = 50.0  # metres around a camera that are measured at most
 
@@ -189,15 +189,9 @@ def prepare(plan: SceneBenchPlan, out: Path) -> SceneBench:
 def check_model(trained: TrainedSceneModel, files: Sequence[TrajectoryFile], allowed: bool) -> None:
     """Raise ``PersistError`` when a model knows other cells than the data's, or was trained on one of their houses."""
     same_form(CellGrid.empty(trained.form.cells, files[0].info.world_up), files[0].cells(0).form, "the model")
-    names = trained.training_scenes.names if trained.training_scenes is not None else frozenset()
-    if trained.training_scenes is None or not trained.training_scenes.complete:
-        warn(f"{trained.folder}: not all scenes that this model was trained on are known")
-    known = next((file for file in files if was_trained_on(file.info, names)), None)
-    if known is not None and not allowed:
-        raise DataError(
-            f"{known.path}: the model was trained on scene {known.info.scene!r}; take data of another split, or "
-            "measure it all the same with --allow-training-scenes"
-        )
+    names = known_names(trained.training_scenes, trained.folder, "this model")
+    if not allowed:
+        refuse_training_scenes(map(ShownScene.of, files), names, f"{OTHER_DATA}, or {ALLOW}")
 
 
 def check_parts(plan: SceneBenchPlan) -> None:

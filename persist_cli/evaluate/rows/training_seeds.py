@@ -10,7 +10,7 @@ from typing import Any
 from persist_cli.api.checkpoint import Checkpoint
 from persist_cli.checkpoints.lineage import ADAPTERS, adapter_recipe, stage_recipes
 from persist_cli.errors import CheckpointError
-from persist_cli.evaluate.journal import first_difference
+from persist_cli.io.begun_with import first_difference
 from persist_cli.recipe import parse_yaml_mapping
 
 OWN = ("base", "description", "chosen_on")  # keys of a recipe that may differ between training seeds

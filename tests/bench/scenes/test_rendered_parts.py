@@ -13,6 +13,7 @@ import torch
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.scene_edits import Copy, Move
 from persist_cli.bench.scenes.edit_part import MOVED, draw_change
+from persist_cli.bench.scenes.journal import SceneJournal
 from persist_cli.bench.scenes.return_part import (
     WINDOW,
     first_visit,
@@ -25,7 +26,6 @@ from persist_cli.bench.scenes.return_part import (
     window_figures,
 )
 from persist_cli.bench.scenes.scene_bench import SceneBench, SceneBenchPlan, chosen_files, read_views
-from persist_cli.bench.scenes.scene_journal import SceneJournal
 from persist_cli.evaluate.statistics import Draws
 from persist_cli.io.files import read_tensors
 from persist_cli.metrics.fvd import LEAST_FRAMES, LEAST_VIDEOS, Fvd

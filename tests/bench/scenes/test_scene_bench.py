@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from persist_cli.api.actions import walking_actions
+from persist_cli.bench.scenes.journal import file_name
 from persist_cli.bench.scenes.plan_pictures import class_colors
 from persist_cli.bench.scenes.run_scene_bench import against_baselines
-from persist_cli.bench.scenes.scene_journal import file_name
 from persist_cli.bench.scenes.walk_part import Wanderer
 from persist_cli.checkpoints.scene_models import find_scene_model
 from tests.conftest import Persist

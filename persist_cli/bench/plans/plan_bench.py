@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 import json
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -16,21 +16,22 @@ from persist_cli.api.cost import Cost
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.policy import Policy
 from persist_cli.api.simulator import Simulator
-from persist_cli.bench.episodes import Episode, EpisodeSet, read_episodes
-from persist_cli.bench.find_episodes import EpisodeSearch
-from persist_cli.bench.make_episodes import draw_episodes
-from persist_cli.bench.navigator import Navigator, PlanSettings, RowParts
-from persist_cli.bench.planning_journal import PlanningJournal, check_row_folders
-from persist_cli.bench.rows import ALONE, NO_MEMORY, PlanningRow, RowChoice, default_rows
-from persist_cli.bench.run_episode import LoopSettings, run_closed_loop, run_open_loop
-from persist_cli.bench.stop_rules import StopAtPlace, StopByCost, StopRule, StopThresholds, stop_thresholds
-from persist_cli.bench.true_scene import TrueScene
+from persist_cli.bench.plans.journal import PlanningJournal, check_row_folders
+from persist_cli.checkpoints.contamination import refuse_training_episodes
 from persist_cli.checkpoints.load import adapter_memory, empty_backbone, load_adapter
 from persist_cli.checkpoints.placement import check_placement
+from persist_cli.episodes.episodes import Episode, EpisodeSet, read_episodes
+from persist_cli.episodes.find_episodes import EpisodeSearch
+from persist_cli.episodes.make_episodes import draw_episodes
+from persist_cli.episodes.navigator import Navigator, PlanSettings, RowParts
+from persist_cli.episodes.rows import ALONE, NO_MEMORY, PlanningRow, RowChoice, default_rows
+from persist_cli.episodes.run_episode import LoopSettings, run_closed_loop, run_open_loop
+from persist_cli.episodes.stop_rules import StopAtPlace, StopByCost, StopRule, StopThresholds, stop_thresholds
+from persist_cli.episodes.true_scene import TrueScene
 from persist_cli.errors import DataError, PersistError, hint
 from persist_cli.evaluate.backbones import BackboneLoader
-from persist_cli.evaluate.journal import Processes
-from persist_cli.evaluate.provenance import checkpoint_json, training_scenes
+from persist_cli.evaluate.processes import Processes
+from persist_cli.evaluate.provenance import checkpoint_json
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.metrics.src import chosen_encoder
 from persist_cli.planning.planners import check_horizon
@@ -38,7 +39,7 @@ from persist_cli.plugins import check_simulator, make_cost, make_simulator
 from persist_cli.policies.open_policy import acting_settings, open_policy
 from persist_cli.policies.trained import TrainedPolicy, find_policy, packaged_policy
 from persist_cli.simulators.collect import CollectPlan
-from persist_cli.viewing.console import add_task, busy, progress, warn
+from persist_cli.viewing.console import add_task, busy, progress
 
 LOOPS: Final = ("closed", "open")
 
@@ -210,8 +211,8 @@ def prepare(plan: BenchPlan, out: Path, processes: Processes) -> PlanningBench:
         episodes = journal.episodes() if journal.begun else plan.source.episodes()
         if checkpoint is not None:
             check_model(checkpoint, rows, episodes)
-        known = known_scenes(checkpoint, trained_policy(policies[plan.policy]))
-        check_scenes(episodes.scenes, known, plan.allow_training_scenes)
+        learned = trained_policy(policies[plan.policy])
+        refuse_training_episodes(episodes.scenes, checkpoint, learned, plan.allow_training_scenes)
         check_budget(plan, rows, episodes)
         journal.begin(values, episodes)
     processes.wait()
@@ -292,34 +293,6 @@ def check_model(checkpoint: Checkpoint, rows: Sequence[PlanningRow], episodes: E
             f"the episodes have images of {ours[0]}x{ours[1]} pixels, {checkpoint.folder} takes {size[0]}x{size[1]}; "
             f"draw episodes with --size {size[0]}x{size[1]}"
         )
-
-
-def check_scenes(scenes: Sequence[str], trained: Mapping[str, Collection[str]], allowed: bool) -> None:
-    """Raise ``DataError`` when something was trained on a scene of the episodes, unless that is allowed.
-
-    Args:
-        scenes: names of the scenes of the episodes.
-        trained: names of the scenes that model and policy were trained on, by words for each.
-        allowed: whether such scenes may be measured.
-    """
-    for words, names in trained.items():
-        known = next((scene for scene in scenes if scene in names), None)
-        if known is not None and not allowed:
-            raise DataError(
-                f"scene {known!r}: {words} was trained on it; take episodes of another split, or measure it all the "
-                "same with --allow-training-scenes"
-            )
-
-
-def known_scenes(checkpoint: Checkpoint | None, policy: TrainedPolicy | None) -> dict[str, Collection[str]]:
-    """Return the names of the scenes that model and policy were trained on, by words for each."""
-    names: dict[str, Collection[str]] = {} if checkpoint is None else {"the model": training_scenes([checkpoint])}
-    if policy is not None:
-        scenes = policy.training_scenes
-        if scenes is None or not scenes.complete:
-            warn(f"{policy.folder}: not all scenes that this policy was trained on are known")
-        names[f"policy {str(policy.folder)!r}"] = scenes.names if scenes is not None else ()
-    return names
 
 
 def trained_policy(policy: Policy | None) -> TrainedPolicy | None:

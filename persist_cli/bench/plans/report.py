@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from persist_cli.bench.plan_bench import LOOPS
-from persist_cli.bench.planning_pictures import EpisodePictures
-from persist_cli.bench.planning_results import COLUMNS
-from persist_cli.bench.planning_tables import (
+from persist_cli.bench.plans.pictures import EpisodePictures
+from persist_cli.bench.plans.plan_bench import LOOPS
+from persist_cli.bench.plans.results import COLUMNS
+from persist_cli.bench.plans.tables import (
     columns_of,
     counted,
     difference_columns,
@@ -40,7 +40,7 @@ def write_planning_report(results: Mapping[str, Any], pictures: Sequence[Episode
 def report_page(results: Mapping[str, Any], pictures: Sequence[EpisodePictures]) -> str:
     """Return the page's HTML."""
     closed = "closed" in results["settings"]["loops"]
-    return page_templates("persist_cli.bench").get_template("planning_report.html.jinja").render(
+    return page_templates("persist_cli.bench.plans").get_template("plan_report.html.jinja").render(
         results=results, sections=[section(table, results) for table in results["tables"]], pictures=pictures,
         success=success_rows(results) if closed else None, facts=environment_facts(results["environment"]),
     )  # fmt: skip

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from persist_cli.bench.episodes import Episode, EpisodeSet, read_episodes
-from persist_cli.bench.rows import NO_MEMORY, PlanningRow
+from persist_cli.episodes.episodes import Episode, EpisodeSet, read_episodes
+from persist_cli.episodes.rows import NO_MEMORY, PlanningRow
 from persist_cli.errors import DataError
-from persist_cli.evaluate.journal import check_same
+from persist_cli.io.begun_with import check_same
 from persist_cli.io.files import read_json, remove_leftovers, write_json
 
 IDENTITY: Final = "plan.json"

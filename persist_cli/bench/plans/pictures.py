@@ -10,11 +10,11 @@ from typing import Any, Final
 from persist_cli.api.geometry import unproject
 from persist_cli.api.memory import MapPoints
 from persist_cli.api.observations import Observations
-from persist_cli.bench.episodes import Episode
-from persist_cli.bench.plan_bench import PlanningBench
-from persist_cli.bench.planning_results import groups
-from persist_cli.bench.rows import PlanningRow
-from persist_cli.bench.true_scene import TrueScene
+from persist_cli.bench.plans.plan_bench import PlanningBench
+from persist_cli.bench.plans.results import groups
+from persist_cli.episodes.episodes import Episode
+from persist_cli.episodes.rows import PlanningRow
+from persist_cli.episodes.true_scene import TrueScene
 from persist_cli.viewing.data_uri import data_uri, png_uri
 from persist_cli.viewing.map import draw_map
 

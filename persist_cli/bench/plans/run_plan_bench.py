@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-from persist_cli.bench.plan_bench import BenchPlan, prepare, run_rows
-from persist_cli.bench.planning_pictures import picture_episodes
-from persist_cli.bench.planning_report import MAPS, PAGE, write_planning_report
-from persist_cli.bench.planning_results import results_json
-from persist_cli.bench.planning_tables import print_results, tables_text
-from persist_cli.evaluate.journal import Processes
+from persist_cli.bench.plans.pictures import picture_episodes
+from persist_cli.bench.plans.plan_bench import BenchPlan, prepare, run_rows
+from persist_cli.bench.plans.report import MAPS, PAGE, write_planning_report
+from persist_cli.bench.plans.results import results_json
+from persist_cli.bench.plans.tables import print_results, tables_text
+from persist_cli.evaluate.processes import Processes
 from persist_cli.io.files import check_folder, write_json, write_text
 from persist_cli.viewing.console import busy, print_json, say
 

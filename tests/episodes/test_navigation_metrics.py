@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from persist_cli.api.actions import rotation_about, walking_actions
-from persist_cli.bench.navigation_metrics import (
+from persist_cli.episodes.navigation_metrics import (
     WalkRecord,
     absolute_error,
     collision_rate,
@@ -22,7 +22,7 @@ from persist_cli.bench.navigation_metrics import (
     success,
     wrong_stop,
 )
-from persist_cli.bench.run_episode import LoopSettings
+from persist_cli.episodes.run_episode import LoopSettings
 from persist_cli.errors import PersistError
 
 UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)

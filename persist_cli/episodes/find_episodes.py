@@ -16,9 +16,9 @@ from persist_cli.api.actions import format_actions
 from persist_cli.api.geometry import in_view
 from persist_cli.api.observations import Observations
 from persist_cli.api.simulator import Simulator, Stand, random_ground
-from persist_cli.bench.episodes import SIGHT_SHARE, Episode, GivenWalk
-from persist_cli.bench.shortest_actions import ShortestActions
-from persist_cli.bench.true_scene import Geodesic, look_from, observations_of, stand
+from persist_cli.episodes.episodes import SIGHT_SHARE, Episode, GivenWalk
+from persist_cli.episodes.shortest_actions import ShortestActions
+from persist_cli.episodes.true_scene import Geodesic, look_from, observations_of, stand
 from persist_cli.errors import DataError, hint
 from persist_cli.evaluate.coverage import seen_share
 from persist_cli.simulators.free_grid import FreeGrid

@@ -13,7 +13,7 @@ from persist_cli.api.cameras import Cameras
 from persist_cli.api.observations import Frame, Observations, TrajectoryInfo
 from persist_cli.api.policy import Goal
 from persist_cli.api.simulator import Simulator, Stand
-from persist_cli.bench.episodes import Episode
+from persist_cli.episodes.episodes import Episode
 from persist_cli.errors import DataError
 from persist_cli.simulators.free_grid import FINE, FreeGrid, Ground
 

@@ -15,9 +15,9 @@ from persist_cli.api.cost import Cost
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.api.policy import Goal, Policy, Situation
 from persist_cli.api.simulator import Simulator
-from persist_cli.bench.rows import PlanningRow
-from persist_cli.bench.stop_rules import view_costs
-from persist_cli.bench.true_scene import TrueScene
+from persist_cli.episodes.rows import PlanningRow
+from persist_cli.episodes.stop_rules import view_costs
+from persist_cli.episodes.true_scene import TrueScene
 from persist_cli.errors import PersistError
 from persist_cli.io.settings import parse_settings
 from persist_cli.memorize.factory import MemoryFactory

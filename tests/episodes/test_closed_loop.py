@@ -12,18 +12,21 @@ from jaxtyping import Float
 from torch import Tensor
 
 from persist_cli.api.geometry import near_poses
-from persist_cli.bench.episodes import Episode
-from persist_cli.bench.navigator import Navigator, PlanSettings, RowParts, retrieved
-from persist_cli.bench.rows import PlanningRow
-from persist_cli.bench.run_episode import LoopSettings, run_closed_loop
-from persist_cli.bench.stop_rules import StopByCost, view_costs
-from persist_cli.bench.true_scene import TrueScene
+from persist_cli.api.ground import Cover
+from persist_cli.episodes.episodes import Episode, EpisodeSet
+from persist_cli.episodes.navigator import Navigator, PlanSettings, RowParts, make_planner, retrieved
+from persist_cli.episodes.rows import PlanningRow
+from persist_cli.episodes.run_episode import LoopSettings, run_closed_loop
+from persist_cli.episodes.stop_rules import StopByCost, view_costs
+from persist_cli.episodes.true_scene import TrueScene
 from persist_cli.planning.judge import NEAR, TURNED
+from persist_cli.planning.planners import CemSettings
 from persist_cli.plugins import make_policy
 from persist_cli.simulators.miniworld import MiniWorld
 from tests.support.pixel_cost import PixelCost
 
 RANKED = PlanningRow("rank-2, simulator", "rank", "random", "simulator", "image", walk=False, candidates=2)
+STRAIGHT = PlanningRow("straight", "policy", "straight", None, "place", walk=False)
 ALONE = PlanningRow("policy", "policy", "random", None, "image", walk=False)
 COST = PixelCost(None)
 
@@ -92,3 +95,23 @@ def test_the_goals_place_is_that_of_the_given_frame_most_like_its_image(scene: T
     found = retrieved(scene.goal, scene.walk(), COST)
     assert found.rgb is None
     torch.testing.assert_close(found.position, scene.goal.position)  # the walk begins at the goal
+
+
+def test_an_agent_that_hit_something_knows_it(episodes: EpisodeSet, small_world: MiniWorld) -> None:
+    scene = TrueScene(small_world, episodes.episodes[0])
+    scene.back_to_start()
+    row, parts = STRAIGHT, RowParts(make_policy("straight", {}))
+    navigator = Navigator(row, parts, PlanSettings(), scene, 8)
+    navigator.collided(scene.look(), "left")
+    occupied = [int((navigator.ground.map().states == Cover.OCCUPIED).sum())]
+    navigator.collided(scene.look(), "forward")
+    occupied.append(int((navigator.ground.map().states == Cover.OCCUPIED).sum()))
+    assert occupied[1] > occupied[0]
+
+
+def test_a_row_of_cem_plans_with_what_was_set_and_keeps_nothing_where_that_is_said() -> None:
+    row = PlanningRow("cem, simulator", "cem", None, "simulator", "place", walk=True, candidates=7)
+    plans = PlanSettings().of_cem(["method.kept=0.3", "method.smoothing=0"], rounds=2)
+    wanted = CemSettings(horizon=5, candidates=7, rounds=2, kept=0.3, smoothing=0.0, shift=0.5)
+    assert make_planner(row, None, plans, 5).settings == wanted
+    assert make_planner(row, None, replace(plans, keep=False), 5).settings == replace(wanted, shift=0.0)

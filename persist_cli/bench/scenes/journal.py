@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from torch import Tensor
 
-from persist_cli.evaluate.journal import check_same
+from persist_cli.io.begun_with import check_same
 from persist_cli.io.files import read_json, read_tensors, remove_leftovers, write_json, write_tensors
 
 IDENTITY: Final = "plan.json"

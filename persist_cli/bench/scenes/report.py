@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from persist_cli.bench.scenes.curves import curve_sections
 from persist_cli.bench.scenes.plan_pictures import COLORS as PLAN_COLORS
 from persist_cli.bench.scenes.plan_pictures import ViewPictures
-from persist_cli.bench.scenes.scene_curves import curve_sections
-from persist_cli.bench.scenes.scene_tables import definitions, tables
+from persist_cli.bench.scenes.tables import definitions, tables
 from persist_cli.evaluate.report.curves import COLORS, DARK_COLORS, HEIGHT, WIDTH
 from persist_cli.evaluate.report.templates import page_templates
 from persist_cli.io.files import write_text

@@ -7,32 +7,26 @@ import json
 import re
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from persist_cli.api.checkpoint import find_checkpoint
-from persist_cli.api.ground import Cover
 from persist_cli.api.policy import Policy
-from persist_cli.bench.episodes import EpisodeSet
-from persist_cli.bench.navigator import Navigator, PlanSettings, RowParts, make_planner
-from persist_cli.bench.plan_bench import EpisodeSource, check_scenes, known_scenes, trained_policy
-from persist_cli.bench.planning_journal import check_row_folders
-from persist_cli.bench.planning_pictures import end_words
-from persist_cli.bench.rows import PlanningRow
-from persist_cli.bench.true_scene import TrueScene
+from persist_cli.bench.plans.journal import check_row_folders
+from persist_cli.bench.plans.pictures import end_words
+from persist_cli.bench.plans.plan_bench import EpisodeSource
+from persist_cli.episodes.episodes import EpisodeSet
+from persist_cli.episodes.rows import PlanningRow
 from persist_cli.errors import DataError
 from persist_cli.metrics.lpips import ALEX, tensor_shapes
-from persist_cli.planning.planners import CemSettings
-from persist_cli.plugins import make_policy
 from persist_cli.policies.open_policy import open_policy
-from persist_cli.simulators.miniworld import MiniWorld
 from tests.conftest import CommandResult, Persist
 from tests.support.micro_runs import run_persist
+from tests.support.miniworlds import make_world
 from tests.support.predictions import cache_random
 from tests.support.processes import run_command, run_in_pair
+from tests.support.small_house import SETTINGS, as_set, episodes_in
 
 Bench = Callable[..., CommandResult]
 
@@ -42,9 +36,13 @@ SEARCH = ("--cost", "distance", "--rows", "cem", "--memories", "simulator")
 
 SIMULATED = ("--memories", "simulator", "--candidates", 2, "--rounds", 1)
 
-ALONE_STRAIGHT = PlanningRow("straight", "policy", "straight", None, "place", walk=False)
-
 TIMES = {"seconds_per_decision", "writing_per_decision", "open_seconds"}
+
+
+@pytest.fixture(scope="module")
+def episodes() -> EpisodeSet:
+    """The episodes of the small house."""
+    return as_set(episodes_in(make_world(**SETTINGS)))
 
 
 @pytest.fixture
@@ -109,18 +107,6 @@ def test_the_classical_policy_finds_goals_whose_place_is_given(bench: Bench) -> 
     assert ended.code == 0, ended.err
     row = json.loads(ended.out)["tables"][0]["rows"]["shortest-path"]
     assert (row["success"]["mean"], row["spl"]["mean"] > 0.6) == (1.0, True)
-
-
-def test_an_agent_that_hit_something_knows_it(episodes: EpisodeSet, small_world: MiniWorld) -> None:
-    scene = TrueScene(small_world, episodes.episodes[0])
-    scene.back_to_start()
-    row, parts = ALONE_STRAIGHT, RowParts(make_policy("straight", {}))
-    navigator = Navigator(row, parts, PlanSettings(), scene, 8)
-    navigator.collided(scene.look(), "left")
-    occupied = [int((navigator.ground.map().states == Cover.OCCUPIED).sum())]
-    navigator.collided(scene.look(), "forward")
-    occupied.append(int((navigator.ground.map().states == Cover.OCCUPIED).sum()))
-    assert occupied[1] > occupied[0]
 
 
 def test_a_stopped_run_that_goes_on_ends_as_an_uninterrupted_one(bench: Bench, tmp_path: Path) -> None:
@@ -250,7 +236,7 @@ def test_rows_of_one_policy_open_it_once(bench: Bench, monkeypatch: pytest.Monke
         opened.append(name)
         return open_policy(name)
 
-    monkeypatch.setattr("persist_cli.bench.plan_bench.open_policy", open_once_more)
+    monkeypatch.setattr("persist_cli.bench.plans.plan_bench.open_policy", open_once_more)
     options = ("--cost", "distance", "--loops", "closed", "--bins", 8, "--patience", 1, "--memories", "simulator")
     ended = bench(*options, "--policy", "straight", "--rows", "policy,rank-1,random")
     assert (ended.code, opened) == (0, ["straight", "random"]), ended.err
@@ -287,14 +273,6 @@ def test_how_cem_searches_can_be_set_and_a_benchmark_begun_before_goes_on(bench:
     assert "holds another benchmark (planning cem: None, now {'elites': 0.5, 'kept'" in bench(*options, *changed).err
     other = json.loads(bench(*options, *changed, "--json", out="other").out)
     assert other["settings"]["planning"] == usual | {"cem": {"elites": 0.5, "kept": 0.3}}
-
-
-def test_a_row_of_cem_plans_with_what_was_set_and_keeps_nothing_where_that_is_said() -> None:
-    row = PlanningRow("cem, simulator", "cem", None, "simulator", "place", walk=True, candidates=7)
-    plans = PlanSettings().of_cem(["method.kept=0.3", "method.smoothing=0"], rounds=2)
-    wanted = CemSettings(horizon=5, candidates=7, rounds=2, kept=0.3, smoothing=0.0, shift=0.5)
-    assert make_planner(row, None, plans, 5).settings == wanted
-    assert make_planner(row, None, replace(plans, keep=False), 5).settings == replace(wanted, shift=0.0)
 
 
 def test_soft_spl_of_older_records_is_made_again_from_what_they_hold(bench: Bench, tmp_path: Path) -> None:
@@ -400,16 +378,6 @@ def test_episodes_of_another_image_size_are_refused(
     assert "--size 32x32" in ended.err
 
 
-def test_scenes_that_the_model_was_trained_on_are_refused(episodes: EpisodeSet, voxel: Path) -> None:
-    trained = known_scenes(find_checkpoint(voxel), policy=None)
-    room = episodes.episodes[0].model_copy(update={"scene_name": "room-0"})
-    known = episodes.model_copy(update={"episodes": [room]})
-    with pytest.raises(DataError, match="'room-0': the model was trained on it"):
-        check_scenes(known.scenes, trained, allowed=False)
-    check_scenes(known.scenes, trained, allowed=True)
-    check_scenes(episodes.scenes, trained, allowed=False)
-
-
 def test_a_trained_policy_acts_alone_and_proposes_what_is_ranked(
     bench: Bench, policy_run: Path, random_lpips: None
 ) -> None:
@@ -419,14 +387,6 @@ def test_a_trained_policy_acts_alone_and_proposes_what_is_ranked(
     rows = json.loads(ended.out)["tables"][0]["rows"]
     assert list(rows) == ["policy", "rank-2, simulator"]
     assert set(rows["rank-2, simulator"]["success"]["differences"]) == {"policy"}
-
-
-def test_scenes_that_the_policy_was_trained_on_are_refused(episodes: EpisodeSet, policy_run: Path) -> None:
-    room = episodes.episodes[0].model_copy(update={"scene_name": "room-1"})
-    known = episodes.model_copy(update={"episodes": [room]})
-    with pytest.raises(DataError, match=r"'room-1': policy .* was trained on it"):
-        check_scenes(known.scenes, known_scenes(None, trained_policy(open_policy(str(policy_run)))), allowed=False)
-    assert known_scenes(None, trained_policy(make_policy("random", {}))) == {}
 
 
 def test_a_policy_that_does_not_look_so_far_is_refused(bench: Bench, policy_run: Path, random_lpips: None) -> None:

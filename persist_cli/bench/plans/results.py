@@ -8,13 +8,13 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from persist_cli.bench.episodes import Episode
 from persist_cli.bench.figure_text import FigureColumn
-from persist_cli.bench.navigation_metrics import SUCCESS_METRES, WalkRecord, soft_spl, way_metres
-from persist_cli.bench.plan_bench import PlanningBench
-from persist_cli.bench.rows import FORGETFUL, NO_MEMORY, POLICY_WALK, RETRIEVAL, SIMULATOR, WALK, PlanningRow
-from persist_cli.bench.stop_rules import AT_PLACE
-from persist_cli.bench.true_scene import TrueScene
+from persist_cli.bench.plans.plan_bench import PlanningBench
+from persist_cli.episodes.episodes import Episode
+from persist_cli.episodes.navigation_metrics import SUCCESS_METRES, WalkRecord, soft_spl, way_metres
+from persist_cli.episodes.rows import FORGETFUL, NO_MEMORY, POLICY_WALK, RETRIEVAL, SIMULATOR, WALK, PlanningRow
+from persist_cli.episodes.stop_rules import AT_PLACE
+from persist_cli.episodes.true_scene import TrueScene
 from persist_cli.evaluate.provenance import checkpoint_json, environment, weight_hashes, weight_sources
 from persist_cli.evaluate.statistics import LEAST_UNITS, RESAMPLES, Draws, Figure, difference, mean_figure
 from persist_cli.io.command_line import running_command

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from persist_cli.bench.figure_text import markdown_table
-from persist_cli.bench.plan_bench import LOOPS
-from persist_cli.bench.planning_results import COLUMNS
+from persist_cli.bench.plans.plan_bench import LOOPS
+from persist_cli.bench.plans.results import COLUMNS
 from persist_cli.viewing.console import print_table, say
 
 SHORT: Final = (

@@ -11,7 +11,7 @@ import torch
 
 from persist_cli.api.actions import format_actions
 from persist_cli.api.observations import Observations
-from persist_cli.bench.navigation_metrics import (
+from persist_cli.episodes.navigation_metrics import (
     WalkRecord,
     absolute_error,
     closed_loop_figures,
@@ -19,9 +19,9 @@ from persist_cli.bench.navigation_metrics import (
     similarity,
     way_metres,
 )
-from persist_cli.bench.navigator import Decision, Navigator
-from persist_cli.bench.stop_rules import StopRule
-from persist_cli.bench.true_scene import TrueScene
+from persist_cli.episodes.navigator import Decision, Navigator
+from persist_cli.episodes.stop_rules import StopRule
+from persist_cli.episodes.true_scene import TrueScene
 from persist_cli.errors import PersistError
 from persist_cli.metrics.networks import missing_weights
 from persist_cli.metrics.src import ENCODERS, VideoFeatures

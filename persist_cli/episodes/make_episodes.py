@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from persist_cli.bench.episodes import Episode, EpisodeSet
-from persist_cli.bench.find_episodes import EpisodeSearch, find_episodes
+from persist_cli.episodes.episodes import Episode, EpisodeSet
+from persist_cli.episodes.find_episodes import EpisodeSearch, find_episodes
 from persist_cli.errors import DataError
 from persist_cli.io.files import check_file
 from persist_cli.plugins import check_simulator, make_simulator

@@ -12,16 +12,16 @@ from typing import Any
 import pytest
 import torch
 
-from persist_cli.bench.episodes import SIGHT_SHARE, Episode, EpisodeSet, read_episodes
-from persist_cli.bench.find_episodes import NEAREST_GOAL, find_episodes
-from persist_cli.bench.navigation_metrics import SUCCESS_METRES
-from persist_cli.bench.shortest_actions import ShortestActions
-from persist_cli.bench.true_scene import Geodesic, TrueScene
+from persist_cli.episodes.episodes import SIGHT_SHARE, Episode, EpisodeSet, read_episodes
+from persist_cli.episodes.find_episodes import NEAREST_GOAL, find_episodes
+from persist_cli.episodes.navigation_metrics import SUCCESS_METRES
+from persist_cli.episodes.shortest_actions import ShortestActions
+from persist_cli.episodes.true_scene import Geodesic, TrueScene
 from persist_cli.errors import DataError
 from persist_cli.simulators.miniworld import MiniWorld
 from persist_cli.simulators.way_back import Pose
-from tests.bench.conftest import HOUSE, SEARCH
 from tests.conftest import Persist
+from tests.support.small_house import HOUSE, SEARCH
 
 
 def test_a_seed_gives_the_same_episodes_again(small_world: MiniWorld, found: list[Episode]) -> None:

@@ -1,4 +1,4 @@
-"""When an agent of the benchmark stops: at the goal's place, or when its view costs little enough.
+"""When an agent stops: at the goal's place, or when its view costs little enough.
 
 What costs little from 1.4 m behind the goal looks as the goal does, only smaller, so that no threshold tells the two
 apart. Agents that imagine therefore take the threshold for having recognised the goal, and go to the best view nearby.
@@ -19,10 +19,10 @@ from persist_cli.api.ground import GroundMap, ground_axes
 from persist_cli.api.observations import Observations
 from persist_cli.api.policy import Goal
 from persist_cli.api.simulator import Simulator, Stand
-from persist_cli.bench.episodes import Episode
-from persist_cli.bench.find_episodes import EpisodeSearch, find_episodes
-from persist_cli.bench.navigation_metrics import SUCCESS_METRES
-from persist_cli.bench.true_scene import TrueScene, look_from, stand
+from persist_cli.episodes.episodes import Episode
+from persist_cli.episodes.find_episodes import EpisodeSearch, find_episodes
+from persist_cli.episodes.navigation_metrics import SUCCESS_METRES
+from persist_cli.episodes.true_scene import TrueScene, look_from, stand
 from persist_cli.errors import PersistError
 from persist_cli.simulators.collect import FIRST_SEED
 

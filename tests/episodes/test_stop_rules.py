@@ -8,8 +8,8 @@ from dataclasses import asdict
 import pytest
 
 from persist_cli.api.policy import Goal
-from persist_cli.bench.episodes import Episode
-from persist_cli.bench.stop_rules import (
+from persist_cli.episodes.episodes import Episode
+from persist_cli.episodes.stop_rules import (
     APPROACH_METRES,
     Approach,
     StopAtPlace,
@@ -19,7 +19,7 @@ from persist_cli.bench.stop_rules import (
     approach,
     choose_threshold,
 )
-from persist_cli.bench.true_scene import TrueScene
+from persist_cli.episodes.true_scene import TrueScene
 from persist_cli.errors import PersistError
 from persist_cli.simulators.miniworld import MiniWorld
 from tests.support.pixel_cost import PixelCost

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from persist_cli.bench.planning_results import compared_with
-from persist_cli.bench.rows import RowChoice, default_rows
+from persist_cli.episodes.rows import RowChoice, default_rows
 from persist_cli.errors import PersistError
 
 
@@ -35,22 +34,6 @@ def test_a_model_that_forgets_can_be_given_the_ground_of_the_walk() -> None:
     assert (led.planner, led.policy, led.walk) == ("cem", "straight", True)
     with pytest.raises(PersistError, match=r"row 'rank-16-walk' is of a model that remembers nothing, .* add none"):
         choice("rank-16-walk", memories=("voxel",)).rows()
-
-
-def test_a_memory_is_compared_with_the_models_that_forget_with_and_without_the_walk() -> None:
-    rows = choice("policy", "rank-16", "rank-16-walk", policy="straight").rows()
-    compared = {row.name: compared_with(row, rows) for row in rows}
-    assert compared["rank-16, voxel"] == ["rank-16-walk, none", "rank-16, none", "policy"]
-    assert compared["rank-16-walk, none"] == ["rank-16, none", "policy"]
-
-
-def test_each_model_is_compared_with_the_simulator_in_its_place_under_the_same_planner() -> None:
-    rows = choice("rank-8", "rank-16", "rank-16-walk", memories=("none", "voxel", "simulator")).rows()
-    compared = {row.name: compared_with(row, rows) for row in rows}
-    assert compared["rank-16, voxel"] == ["rank-16-walk, none", "rank-16, none", "rank-16, simulator"]
-    assert compared["rank-16-walk, none"] == ["rank-16, none", "rank-16, simulator"]
-    assert compared["rank-8, none"] == ["rank-8, simulator"]
-    assert compared["rank-8, simulator"] == ["rank-8, none"]
 
 
 def test_the_classical_planner_is_told_the_place_whatever_the_others_see() -> None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from persist_cli.bench.scenes.scene_curves import curve_sections
+from persist_cli.bench.scenes.curves import curve_sections
 from persist_cli.bench.scenes.walk_part import COLUMNS
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from persist_cli.errors import PersistError
-from persist_cli.evaluate.journal import check_same
+from persist_cli.io.begun_with import check_same
 
 
 def plan(path: str, fingerprint: str) -> dict[str, object]:

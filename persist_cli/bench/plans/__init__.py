@@ -1,0 +1,1 @@
+"""How good plans are, measured by what an agent that follows them does in the true scene."""
