@@ -161,9 +161,8 @@ class Walker:
         if self.random.random() < self.settings.explore:
             way = self.explorer.proposals(situation, horizon, 1, self.generator)[0]
         else:
-            way = self._chosen(
-                self.policy.proposals(situation, horizon, self.settings.proposals, self.generator), ground
-            )
+            proposed = self.policy.proposals(situation, horizon, self.settings.proposals, self.generator)
+            way = self._chosen(proposed, ground)
         if not way:
             self._new_goal()
             way = self.explorer.proposals(situation, horizon, 1, self.generator)[0]

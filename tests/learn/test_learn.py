@@ -6,7 +6,7 @@ import json
 import math
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,7 +18,7 @@ from safetensors.torch import load_file, save_file
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.ground import Body
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
-from persist_cli.api.policy import Goal
+from persist_cli.api.policy import Goal, Policy
 from persist_cli.checkpoints.load import adapter_memory, load_backbone
 from persist_cli.data.store import Store, write_trajectory
 from persist_cli.episodes.run_episode import LoopSettings
@@ -77,12 +77,8 @@ def test_a_walk_begins_at_a_given_view_and_each_frame_follows_from_its_action(pl
         assert len(walk.actions) + walk.blocked == SETTINGS.actions
 
 
-@dataclass(frozen=True)
-class OneOrThree:
+class OneOrThree(Policy):
     """A policy of proposals of one action or of three, as the draws say."""
-
-    frames: int = 1
-    longest: int | None = None
 
     def propose(self, situation, horizon, count, generator) -> list[tuple[str, ...]]:
         long = torch.randint(0, 2, (count,), generator=generator).tolist()
@@ -92,18 +88,17 @@ class OneOrThree:
 def test_a_walk_that_is_done_waits_for_the_others_without_acting(place, walks):
     place.first.body = Body()
     views = Store(walks)[0].read(range(12)).observations
-    settings, policy = PracticeSettings(walks=3, actions=16, execute=3, explore=0.0, batch=3), OneOrThree()
+    settings, policy = PracticeSettings(walks=3, actions=16, execute=3, explore=0.0, batch=3), OneOrThree(None)
     found = list(practise(place, (policy, policy), views, settings, 1))
     assert sum(walk.blocked for walk in found) > 0
     assert [len(walk.actions) + walk.blocked for walk in found] == [16] * 3
 
 
-class Proposes:
+class Proposes(Policy):
     """A policy of fixed proposals."""
 
-    frames, longest = 1, None
-
     def __init__(self, *ways: str) -> None:
+        super().__init__(None)
         self.ways = [tuple(way.split()) for way in ways]
 
     def propose(self, situation, horizon, count, generator) -> list[tuple[str, ...]]:
