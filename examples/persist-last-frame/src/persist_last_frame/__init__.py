@@ -44,7 +44,7 @@ class LastFrame(Memory):
         origin, frames = observations.by_origin()[0]  # the observed ones, if there are any
         if origin < self._origin:
             return
-        features = self.encoder.encode(frames.rgb[-1:])  # [1, rows, columns, channel]
+        features = self.encoder.encoded(frames.rgb[-1:])  # [1, rows, columns, channel]
         self._features = features[0].flatten(0, 1)
         self._center = frames.cameras.centers[-1:].double()
         self._origin = frames.origins[-1:]
