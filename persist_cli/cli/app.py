@@ -12,6 +12,8 @@ from typing import Annotated, Any
 import typer
 
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
+from persist_cli.cli.bench import bench_app
+from persist_cli.cli.catalog import catalog_app
 from persist_cli.cli.options import (
     DEFAULT_CONTROLS,
     ActionsOption,
@@ -49,7 +51,6 @@ from persist_cli.cli.planning import planning_app
 from persist_cli.cli.playing import playing_app
 from persist_cli.cli.scenes import scenes_app
 from persist_cli.cli.viewing import viewing_app
-from persist_cli.cli.weights import weights_app
 from persist_cli.errors import TRACEBACK, PersistError
 
 app = typer.Typer(
@@ -60,8 +61,9 @@ app = typer.Typer(
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
 )
-app.add_typer(weights_app, name="weights")
+app.add_typer(catalog_app)
 app.add_typer(planning_app)
+app.add_typer(bench_app, name="bench")
 app.add_typer(playing_app)
 app.add_typer(scenes_app)
 app.add_typer(viewing_app)
@@ -422,29 +424,3 @@ def doctor(
     from persist_cli.doctor.machine import machine_of
 
     run_doctor(recipe, overrides or [], machine_of(gpus, gpu_memory), fsdp, json)
-
-
-@app.command()
-def plugins(json: JsonOption = False) -> None:
-    """List every plugin: backbones, memories, encoders, simulators, importers, policies, costs, scene models."""
-    from persist_cli.viewing.listings import show_plugins
-
-    show_plugins(json)
-
-
-@app.command()
-def recipes(
-    name: Annotated[str | None, typer.Argument(help="A recipe, or a YAML file, to show with every setting.")] = None,
-    json: JsonOption = False,
-) -> None:
-    """List the recipes that come with persist, or show one with every setting, as YAML to start from.
-
-    persist recipes tiny-stage1 > mine.yaml
-    """
-    if name is None:
-        from persist_cli.viewing.listings import show_recipes
-
-        return show_recipes(json)
-    from persist_cli.viewing.recipe_page import show_recipe
-
-    show_recipe(name, json)
