@@ -337,12 +337,16 @@ def rollout(
     persist rollout --start sample#0:32 --actions "left*4 forward*6" --out runs/rollout
     """
     from persist_cli.rollout.camera_path import RolloutPlan
+    from persist_cli.rollout.open_world import WorldOptions
     from persist_cli.rollout.rollout import run_rollout
 
+    world = WorldOptions(
+        start=start, memory=memory, adapter=adapter, write=write, seed=seed, body=body,
+        sampling=SamplingOverrides(steps, sampler, guidance, context_noise),
+        placement=InferenceOptions.of(dtype, save_memory),
+    )  # fmt: skip
     plan = RolloutPlan(
-        start=start, actions=tuple(actions or ()), follow=follow, frames=frames, memory=memory, adapter=adapter,
-        write=write, seed=seed, sampling=SamplingOverrides(steps, sampler, guidance, context_noise),
-        placement=InferenceOptions.of(dtype, save_memory), step=step, turn=turn, body=body,
+        world=world, actions=tuple(actions or ()), follow=follow, frames=frames, step=step, turn=turn
     )  # fmt: skip
     run_rollout(checkpoint, plan, out, json)
 

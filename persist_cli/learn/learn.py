@@ -42,8 +42,7 @@ from persist_cli.plugins import make_policy, make_settings
 from persist_cli.policies.open_policy import acting_settings, open_policy
 from persist_cli.policies.trained import TrainedPolicy, find_policy, packaged_policy
 from persist_cli.recipe import apply_overrides, make_recipe
-from persist_cli.rollout.camera_path import RolloutPlan
-from persist_cli.rollout.open_world import assemble_world
+from persist_cli.rollout.open_world import WorldOptions, assemble_world
 from persist_cli.train.finetune import FinetunePlan, run_finetune
 from persist_cli.train.sources import weights_hash
 from persist_cli.viewing.console import add_task, print_json, print_table, progress, say
@@ -317,11 +316,11 @@ def open_place(learning: Learning) -> PracticePlace:
         return TruePlace(learning.simulator, info)
     checkpoint = find_checkpoint(plan.checkpoint)
     adapter = checkpoint.chosen_adapter(plan.adapter)
-    rollout = RolloutPlan(
-        start=plan.views[0], actions=(), follow=False, frames=0, memory=None, adapter=plan.adapter, write=True,
-        seed=plan.seed, sampling=plan.sampling, placement=plan.placement, body=plan.body,
+    options = WorldOptions(
+        start=plan.views[0], adapter=plan.adapter, seed=plan.seed, sampling=plan.sampling, placement=plan.placement,
+        body=plan.body,
     )  # fmt: skip
-    world = assemble_world(checkpoint, adapter, rollout, info)
+    world = assemble_world(checkpoint, adapter, options, info)
     world.agents[0].memorize(learning.views, world.backbone.device)
     origin = {"model": checkpoint.fingerprint, "adapter": adapter or PLAIN}
     return ImaginedPlace(world, info, origin)

@@ -34,8 +34,8 @@ from persist_cli.planning.outputs import Planned, write_plan
 from persist_cli.planning.planners import Cem, CemSettings, OnRound, Plan, Rank, RankSettings, action_names
 from persist_cli.plugins import make_cost
 from persist_cli.policies.open_policy import open_policy
-from persist_cli.rollout.camera_path import RolloutPlan, walking_vocabulary
-from persist_cli.rollout.open_world import assemble_world
+from persist_cli.rollout.camera_path import walking_vocabulary
+from persist_cli.rollout.open_world import WorldOptions, assemble_world
 from persist_cli.rollout.surroundings import Surroundings
 from persist_cli.rollout.world_model import Agent, WorldModel
 from persist_cli.viewing.console import add_task, busy, print_json, print_table, progress, say, warn
@@ -78,12 +78,11 @@ class PlanOptions:
     turn: float | None = None
 
     @property
-    def rollout(self) -> RolloutPlan:
-        """The same options as a rollout's, which a world model is put together by."""
-        return RolloutPlan(
-            start=self.start, actions=(), follow=False, frames=0, memory=self.memory, adapter=self.adapter, write=True,
-            seed=self.seed, sampling=self.sampling, placement=self.placement, step=self.step, turn=self.turn,
-            body=self.body,
+    def world(self) -> WorldOptions:
+        """Those of the options that a world model is put together with."""
+        return WorldOptions(
+            start=self.start, memory=self.memory, adapter=self.adapter, seed=self.seed, sampling=self.sampling,
+            placement=self.placement, body=self.body,
         )  # fmt: skip
 
 
@@ -141,7 +140,7 @@ def plan_parts(options: PlanOptions) -> PlanParts:
     """
     reference = parse_reference(options.start)
     file = reference.single()
-    vocabulary = walking_vocabulary(file, options.rollout)
+    vocabulary = walking_vocabulary(file, options.start, options.step, options.turn)
     start = file.read([reference.frame])
     start = dataclasses.replace(start, info=dataclasses.replace(start.info, vocabulary=vocabulary))
     budget = Budget(options.frames, options.seconds)
@@ -196,7 +195,7 @@ def chosen_planner(options: PlanOptions, policy: Policy | None, settings: dict[s
 
 def open_model(checkpoint: Checkpoint, adapter: str | None, options: PlanOptions, start: Trajectory) -> WorldModel:
     """Return the world model with its agent at the start frame."""
-    model = assemble_world(checkpoint, adapter, options.rollout, start.info)
+    model = assemble_world(checkpoint, adapter, options.world, start.info)
     model.reset([start.observations], [start.info])
     return model
 
