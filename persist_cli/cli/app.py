@@ -155,7 +155,8 @@ def import_(
     """
     from persist_cli.data.importers.importing import ImportPlan, run_import
 
-    run_import(format, source, out, ImportPlan.of(size, every, step, turn, skip_bad, hold_out), json)
+    plan = ImportPlan.of(size=size, every=every, step=step, turn=turn, skip_bad=skip_bad, hold_out=hold_out)
+    run_import(format, source, out, plan, json)
 
 
 @app.command()
@@ -206,7 +207,11 @@ def finetune(
     if cache is None and cache_gigabytes is not None:
         raise PersistError("--cache-gigabytes bounds a cache; give --cache DIR too")
     bounded = None if cache is None else CacheSettings(cache, 20 if cache_gigabytes is None else cache_gigabytes)
-    run_finetune(FinetunePlan(recipe, overrides or [], data or [], out, resume, bounded, profile))
+    plan = FinetunePlan(
+        recipe=recipe, overrides=overrides or [], data=data or [], out=out, resume=resume, cache=bounded,
+        profile=profile,
+    )  # fmt: skip
+    run_finetune(plan)
 
 
 @app.command()
@@ -239,7 +244,11 @@ def export(
 
     sampling = SamplingOverrides(steps, sampler, guidance, context_noise)
     protocols = SamplingOverrides.by_protocol(sampling_for or [])
-    run_export(ExportPlan(checkpoint, runs or [], dtype, default, sampling, protocols), out, json)
+    plan = ExportPlan(
+        checkpoint=checkpoint, runs=runs or [], dtype=dtype, default=default, sampling=sampling,
+        protocol_sampling=protocols,
+    )  # fmt: skip
+    run_export(plan, out, json)
 
 
 @app.command()
@@ -301,7 +310,10 @@ def memorize(
             context, "data merge out json verify", "not with --merge, which joins memories as they are"
         )
         return run_merge([*merge, *(Path(name) for name in data or [])], out, json)
-    plan = MemorizePlan(memory, encoder, settings or [], checkpoint, model, complete, seed)
+    plan = MemorizePlan(
+        memory=memory, encoder=encoder, settings=settings or [], checkpoint=checkpoint, model=model, complete=complete,
+        seed=seed,
+    )  # fmt: skip
     run_memorize(data or [], plan, PictureOptions(depth, depth_model, fov, size), out, json)
 
 

@@ -86,8 +86,11 @@ def bench_episodes(
     from persist_cli.bench.make_episodes import run_episodes
     from persist_cli.simulators.collect import CollectPlan
 
-    search = EpisodeSearch(whole_numbers("--bins", bins), each, walk_frames, seed, per_scene, goal_gap, goals)
-    run_episodes(CollectPlan(simulator, scenes, size=size, split=split), search, out, json)
+    search = EpisodeSearch(
+        bins=whole_numbers("--bins", bins), each=each, walk_frames=walk_frames, seed=seed, per_scene=per_scene,
+        goal_gap=goal_gap, goals=goals,
+    )  # fmt: skip
+    run_episodes(CollectPlan(simulator=simulator, scenes=scenes, size=size, split=split), search, out, json)
 
 
 @bench_app.command("collisions")
@@ -118,9 +121,10 @@ def bench_collisions(
     from persist_cli.simulators.collect import CollectPlan
 
     plan = CollisionPlan(
-        CollectPlan(simulator, scenes, split=split, seed=seed), walks, actions,
-        None if memories is None else split_names(memories), SamplingOverrides(steps, sampler, guidance, context_noise),
-        InferenceOptions.of(dtype, save_memory),
+        scenes=CollectPlan(simulator=simulator, scenes=scenes, split=split, seed=seed), walks=walks, actions=actions,
+        memories=None if memories is None else split_names(memories),
+        sampling=SamplingOverrides(steps, sampler, guidance, context_noise),
+        placement=InferenceOptions.of(dtype, save_memory),
     )  # fmt: skip
     run_collisions(checkpoint, plan, out, json)
 
@@ -152,29 +156,29 @@ def bench_plan(
     settings: CemSettingsOption = None,
     approach: Annotated[bool, typer.Option(help="Go to the best imagined view of a goal in sight, then stop.")] = True,
     explore: Annotated[bool, typer.Option(help="Plans that end where the agent has looked already come last.")] = True,
-    steps: StepsOption = None,
-    sampler: SamplerOption = None,
-    guidance: GuidanceOption = None,
-    dtype: DtypeOption = None,
-    save_memory: SaveMemoryOption = None,
-    verify: VerifyOption = False,
+    steps: StepsOption = None, sampler: SamplerOption = None, guidance: GuidanceOption = None,
+    dtype: DtypeOption = None, save_memory: SaveMemoryOption = None, verify: VerifyOption = False,
     allow_training_scenes: TrainingScenesOption = False,
     out: Annotated[Path, typer.Option(help="Folder of all results; a stopped run goes on.")] = Path("runs/bench-plan"),
     report: Annotated[Path | None, typer.Option(help="Folder for report.html and maps.")] = None,
     json: JsonOption = False,
-) -> None:
+) -> None:  # fmt: skip
     """Compare plans with other memories, policies and no model, by episodes in held-out houses.
 
     persist bench plan --scenes 0:24 --rows random,rank-8 --memories none,voxel --report runs/plans
     """
     from persist_cli.bench import navigator, plan_bench, run_episode, run_plan_bench
 
+    planning = navigator.PlanSettings(
+        horizon=horizon, over=over, frames=frames, seconds=seconds, body=body, keep=keep, approach=approach,
+        explore=explore,
+    ).of_cem(settings, candidates, rounds)  # fmt: skip
     run_plan_bench.run_plan_bench(plan_bench.BenchPlan(
-        plan_bench.EpisodeSource.of(episodes, scenes, whole_numbers("--bins", bins) if bins else None, each),
-        checkpoint, split_names(rows) if rows else None, split_names(memories), policy, cost, navigator.PlanSettings(
-            horizon, over, frames, seconds, body, keep, approach, explore).of_cem(settings, candidates, rounds),
-        split_names(loops), run_episode.LoopSettings(execute, patience, max_actions=max_actions), stop_cost,
-        SamplingOverrides(steps, sampler, guidance), InferenceOptions.of(dtype, save_memory), allow_training_scenes,
+        source=plan_bench.EpisodeSource.of(episodes, scenes, whole_numbers("--bins", bins) if bins else None, each),
+        checkpoint=checkpoint, rows=split_names(rows) if rows else None, memories=split_names(memories), policy=policy,
+        cost=cost, planning=planning, loops=split_names(loops), allow_training_scenes=allow_training_scenes,
+        loop=run_episode.LoopSettings(execute, patience, max_actions=max_actions), stop_cost=stop_cost,
+        sampling=SamplingOverrides(steps, sampler, guidance), placement=InferenceOptions.of(dtype, save_memory),
     ), out, report, json)  # fmt: skip
 
 
@@ -224,8 +228,8 @@ def bench_scene(
         sampling = SamplingOverrides(denoising_steps, sampler, guidance)
         placement = InferenceOptions.of(dtype, save_memory)
         rendering = RenderingPlan(checkpoint, split_names(memories), return_steps, sampling, placement)
-    plan = SceneBenchPlan(
-        model, data, train, chosen, images, seeds, radius, houses, walk_steps, walks, rendering, edits, interactions,
-        tuple(settings or ()), seed, allow_training_scenes,
-    )  # fmt: skip
-    run_scene_bench(plan, out, report, json)
+    run_scene_bench(SceneBenchPlan(
+        model=model, data=data, train=train, parts=chosen, images=images, seeds=seeds, radius=radius, houses=houses,
+        steps=walk_steps, walks=walks, rendering=rendering, edits=edits, interactions=interactions,
+        settings=tuple(settings or ()), seed=seed, allow_training_scenes=allow_training_scenes,
+    ), out, report, json)  # fmt: skip

@@ -127,11 +127,11 @@ def learn(
 
     if episodes is None:
         refuse_options(context, "patience stop_cost", "only with --episodes, which are run so")
-    plan = LearnPlan(
+    run_learn(LearnPlan(
         views=tuple(views), policy=policy, inside=inside, checkpoint=checkpoint, adapter=adapter, rounds=rounds,
-        practice=PracticeSettings(walks, actions, execute, explore, batch, proposals), steps=training_steps,
-        training=tuple(settings or ()), episodes=episodes, loop=LoopSettings(patience=patience),
+        practice=PracticeSettings(
+            walks=walks, actions=actions, execute=execute, explore=explore, batch=batch, proposals=proposals),
+        steps=training_steps, training=tuple(settings or ()), episodes=episodes, loop=LoopSettings(patience=patience),
         sampling=SamplingOverrides(steps, sampler, guidance, context_noise), seed=seed, body=body, stop_cost=stop_cost,
         placement=InferenceOptions.of(dtype, save_memory), allow_training_scenes=allow_training_scenes,
-    )  # fmt: skip
-    run_learn(plan, out, json)
+    ), out, json)  # fmt: skip

@@ -58,7 +58,7 @@ MODEL, SIMULATOR = "model", "simulator"  # where a policy may practise
 LOOK: Final = ("light", "gains", "depth_sensor")  # of a collecting camera, which the true house has not
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class LearnPlan:
     """The options of ``persist learn``.
 
@@ -102,7 +102,7 @@ class LearnPlan:
     allow_training_scenes: bool = False
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Learning:
     """A plan that was checked, with all that a round needs.
 
@@ -190,7 +190,7 @@ def prepare(plan: LearnPlan, out: Path) -> Learning:
         check_held_out(plan, begin, info.scene)
     check_horizon(plan, begin)
     make_recipe(apply_overrides(recipe_of_round(plan, begin, 1), plan.training), "--set")
-    learning = Learning(plan, out, info, views, begin, simulator, episodes)
+    learning = Learning(plan=plan, out=out, info=info, views=views, begin=begin, simulator=simulator, episodes=episodes)
     check_plan(learning)
     return learning
 
@@ -372,7 +372,7 @@ def train(learning: Learning, number: int) -> None:
     if not file.is_file():
         write_text(file, yaml.safe_dump(recipe, sort_keys=False))
     data = [learning.folder(one) / "walks" for one in range(1, number + 1)]
-    run_finetune(FinetunePlan(str(file), plan.training, data, run, resume=True))
+    run_finetune(FinetunePlan(recipe=str(file), overrides=plan.training, data=data, out=run, resume=True))
 
 
 def evaluate(learning: Learning, number: int) -> None:

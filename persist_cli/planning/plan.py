@@ -45,7 +45,7 @@ OVER: dict[str, Over] = {"last": "last", "best": "best"}
 SHOWN = 5  # candidates in the terminal's table and on the sheet
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PlanOptions:
     """The options of ``persist plan``; see its help.
 
@@ -86,7 +86,7 @@ class PlanOptions:
         )  # fmt: skip
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PlanParts:
     """What a plan is made with, checked before a model is loaded.
 
@@ -156,7 +156,10 @@ def plan_parts(options: PlanOptions) -> PlanParts:
     check_goal(goal, cost, policy)
     first = max(0, reference.frame + 1 - (policy.frames if policy is not None else 1))
     seen = file.read(range(first, reference.frame + 1)).observations
-    return PlanParts(start, seen, goal, planner, policy, cost, budget, OVER[options.over])
+    return PlanParts(
+        start=start, seen=seen, goal=goal, planner=planner, policy=policy, cost=cost, budget=budget,
+        over=OVER[options.over],
+    )  # fmt: skip
 
 
 def chosen_policy(options: PlanOptions, settings: dict[str, Any]) -> Policy | None:

@@ -26,7 +26,7 @@ from persist_cli.rollout.world_model import Agent
 from persist_cli.viewing.console import busy
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PlayOptions:
     """What is walked in.
 

@@ -248,7 +248,9 @@ def compare(
     known = Observations.concatenate([start, truth])
     frames, height, width = known.depth.shape
     depth = bool((truth.depth > 0).any())
-    setup = Setup(1, frames - 1, height, width, depth, gives_depth, returns=False)
+    setup = Setup(
+        clips=1, frames=frames - 1, height=height, width=width, depth=depth, generated_depth=gives_depth, returns=False
+    )
     generated = (torch.cat([start.rgb, seen.rgb]), torch.cat([start.depth, seen.depth]))
     prediction = Prediction(*generated, known, torch.full((frames,), -1))
     prediction.check("rollout")

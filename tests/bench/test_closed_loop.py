@@ -23,8 +23,11 @@ from persist_cli.plugins import make_policy
 from persist_cli.simulators.miniworld import MiniWorld
 from tests.support.pixel_cost import PixelCost
 
-RANKED = PlanningRow("rank-2, simulator", "rank", "random", "simulator", "image", walk=False, candidates=2)
-ALONE = PlanningRow("policy", "policy", "random", None, "image", walk=False)
+RANKED = PlanningRow(
+    name="rank-2, simulator", planner="rank", policy="random", memory="simulator", goal="image", walk=False,
+    candidates=2,
+)  # fmt: skip
+ALONE = PlanningRow(name="policy", planner="policy", policy="random", memory=None, goal="image", walk=False)
 COST = PixelCost(None)
 
 

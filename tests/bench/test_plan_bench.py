@@ -42,7 +42,9 @@ SEARCH = ("--cost", "distance", "--rows", "cem", "--memories", "simulator")
 
 SIMULATED = ("--memories", "simulator", "--candidates", 2, "--rounds", 1)
 
-ALONE_STRAIGHT = PlanningRow("straight", "policy", "straight", None, "place", walk=False)
+ALONE_STRAIGHT = PlanningRow(
+    name="straight", planner="policy", policy="straight", memory=None, goal="place", walk=False
+)
 
 TIMES = {"seconds_per_decision", "writing_per_decision", "open_seconds"}
 
@@ -172,7 +174,10 @@ def test_two_rows_that_would_be_kept_in_one_place_are_refused(bench: Bench, tmp_
 
 def test_rows_of_one_folder_are_refused_before_any_is_run() -> None:
     memories = ("voxel_2", "none", "voxel-2")
-    rows = [PlanningRow(f"rank-8, {name}", "rank", "random", name, "image", False) for name in memories]
+    rows = [
+        PlanningRow(name=f"rank-8, {name}", planner="rank", policy="random", memory=name, goal="image", walk=False)
+        for name in memories
+    ]
     check_row_folders(rows[:2])
     with pytest.raises(DataError, match="'rank-8, voxel_2' and 'rank-8, voxel-2' would be kept in one folder"):
         check_row_folders(rows)
@@ -290,7 +295,9 @@ def test_how_cem_searches_can_be_set_and_a_benchmark_begun_before_goes_on(bench:
 
 
 def test_a_row_of_cem_plans_with_what_was_set_and_keeps_nothing_where_that_is_said() -> None:
-    row = PlanningRow("cem, simulator", "cem", None, "simulator", "place", walk=True, candidates=7)
+    row = PlanningRow(
+        name="cem, simulator", planner="cem", policy=None, memory="simulator", goal="place", walk=True, candidates=7
+    )
     plans = PlanSettings().of_cem(["method.kept=0.3", "method.smoothing=0"], rounds=2)
     wanted = CemSettings(horizon=5, candidates=7, rounds=2, kept=0.3, smoothing=0.0, shift=0.5)
     assert make_planner(row, None, plans, 5).settings == wanted

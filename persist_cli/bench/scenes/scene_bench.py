@@ -73,7 +73,7 @@ class RenderingPlan:
     placement: InferenceOptions
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SceneBenchPlan:
     """The options of ``persist bench scene``.
 
@@ -118,7 +118,7 @@ class SceneBenchPlan:
         return scene_config(form, plugin_settings(self.settings, ("memory",))["memory"])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SceneBench:
     """A benchmark that was checked and is ready to be run.
 
@@ -183,7 +183,7 @@ def prepare(plan: SceneBenchPlan, out: Path) -> SceneBench:
     if "evolution" in plan.parts:
         events = find_events(plan.data, {view.scene for view in views}, plan.interactions, plan.seed)
     journal.begin(identity(plan, views), part_identities(plan, houses, trained))
-    return SceneBench(plan, views, houses, journal, trained, events)
+    return SceneBench(plan=plan, views=views, houses=houses, journal=journal, trained=trained, events=events)
 
 
 def check_model(trained: TrainedSceneModel, files: Sequence[TrajectoryFile], allowed: bool) -> None:
