@@ -260,7 +260,10 @@ def read_view(file: TrajectoryFile, frame: int, radius: float, scenes: Scenes) -
     truth = true_region(cells, region)
     near = near_camera(truth, image.cameras.centers[0], radius)
     name, sha256 = f"{file.name}:{frame}", file_sha256(file.path)
-    view = View(name, file.info.scene, file.info, image, region, truth, truth, near, cells, sha256)
+    view = View(
+        name=name, scene=file.info.scene, info=file.info, frame=image, region=region, known=truth, truth=truth,
+        near=near, house=cells, sha256=sha256,
+    )  # fmt: skip
     known = same_form(region.of(scenes.after(view).cells), truth.form, "the scene")
     return replace(view, known=known)
 
