@@ -70,7 +70,7 @@ def test_a_memory_is_built_and_read_where_its_frames_lie_and_is_that_of_the_cpu(
 
 @pytest.mark.parametrize("name", MAPS)
 def test_what_a_clip_remembers_is_made_where_it_trains(name, walks):
-    clip = ClipDataset([walks], ClipPlan(9, (1,), 12, 3, (SIZE, SIZE)))[5]
+    clip = ClipDataset([walks], ClipPlan(frames=9, strides=(1,), context_frames=12, seed=3, image_size=(SIZE, SIZE)))[5]
     here, there = (
         with_memory(clip, MemoryFactory.of(MemoryConfig(name), device), 64).tokens for device in ("cpu", DEVICE)
     )

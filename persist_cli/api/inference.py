@@ -17,7 +17,7 @@ Offload = Literal["none", "model", "sequential"]
 SAVINGS = ("model-offload", "sequential-offload", "vae-slicing", "vae-tiling")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class InferenceOptions:
     """Precision and memory savings of a backbone that samples.
 
@@ -55,7 +55,7 @@ class InferenceOptions:
             raise PersistError("--save-memory has model-offload and sequential-offload; give one of them")
         offloads: dict[str, Offload] = {"model-offload": "model", "sequential-offload": "sequential"}
         offload = next((offload for word, offload in offloads.items() if word in words), "none")
-        return cls(dtype, offload, "vae-slicing" in words, "vae-tiling" in words)  # type: ignore[arg-type]
+        return cls(dtype=dtype, offload=offload, slicing="vae-slicing" in words, tiling="vae-tiling" in words)  # type: ignore[arg-type]
 
     def changes(self) -> dict[str, Any]:
         """Return the options that change results as JSON values; empty for a checkpoint as it is."""

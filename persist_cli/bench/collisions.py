@@ -59,7 +59,7 @@ Counts = NDArray[
 ]  # along the last axis: truly blocked and said so, said so alone, truly blocked alone, neither
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CollisionPlan:
     """The options of ``persist bench collisions``.
 

@@ -57,7 +57,7 @@ LOADED_FROM: Final = "_name_or_path"  # the key under which diffusers notes wher
 NAMED_RUN: Final = re.compile(r"(?P<name>[A-Za-z0-9][A-Za-z0-9_-]*)=(?P<run>.+)")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ExportPlan:
     """The options of ``persist export``; see its help."""
 

@@ -12,6 +12,8 @@ from typing import Annotated, Any
 import typer
 
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
+from persist_cli.cli.bench import bench_app
+from persist_cli.cli.catalog import catalog_app
 from persist_cli.cli.options import (
     DEFAULT_CONTROLS,
     ActionsOption,
@@ -49,7 +51,6 @@ from persist_cli.cli.planning import planning_app
 from persist_cli.cli.playing import playing_app
 from persist_cli.cli.scenes import scenes_app
 from persist_cli.cli.viewing import viewing_app
-from persist_cli.cli.weights import weights_app
 from persist_cli.errors import TRACEBACK, PersistError
 
 app = typer.Typer(
@@ -60,8 +61,9 @@ app = typer.Typer(
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
 )
-app.add_typer(weights_app, name="weights")
+app.add_typer(catalog_app)
 app.add_typer(planning_app)
+app.add_typer(bench_app, name="bench")
 app.add_typer(playing_app)
 app.add_typer(scenes_app)
 app.add_typer(viewing_app)
@@ -153,7 +155,8 @@ def import_(
     """
     from persist_cli.data.importers.importing import ImportPlan, run_import
 
-    run_import(format, source, out, ImportPlan.of(size, every, step, turn, skip_bad, hold_out), json)
+    plan = ImportPlan.of(size=size, every=every, step=step, turn=turn, skip_bad=skip_bad, hold_out=hold_out)
+    run_import(format, source, out, plan, json)
 
 
 @app.command()
@@ -204,7 +207,11 @@ def finetune(
     if cache is None and cache_gigabytes is not None:
         raise PersistError("--cache-gigabytes bounds a cache; give --cache DIR too")
     bounded = None if cache is None else CacheSettings(cache, 20 if cache_gigabytes is None else cache_gigabytes)
-    run_finetune(FinetunePlan(recipe, overrides or [], data or [], out, resume, bounded, profile))
+    plan = FinetunePlan(
+        recipe=recipe, overrides=overrides or [], data=data or [], out=out, resume=resume, cache=bounded,
+        profile=profile,
+    )  # fmt: skip
+    run_finetune(plan)
 
 
 @app.command()
@@ -237,7 +244,11 @@ def export(
 
     sampling = SamplingOverrides(steps, sampler, guidance, context_noise)
     protocols = SamplingOverrides.by_protocol(sampling_for or [])
-    run_export(ExportPlan(checkpoint, runs or [], dtype, default, sampling, protocols), out, json)
+    plan = ExportPlan(
+        checkpoint=checkpoint, runs=runs or [], dtype=dtype, default=default, sampling=sampling,
+        protocol_sampling=protocols,
+    )  # fmt: skip
+    run_export(plan, out, json)
 
 
 @app.command()
@@ -299,7 +310,10 @@ def memorize(
             context, "data merge out json verify", "not with --merge, which joins memories as they are"
         )
         return run_merge([*merge, *(Path(name) for name in data or [])], out, json)
-    plan = MemorizePlan(memory, encoder, settings or [], checkpoint, model, complete, seed)
+    plan = MemorizePlan(
+        memory=memory, encoder=encoder, settings=settings or [], checkpoint=checkpoint, model=model, complete=complete,
+        seed=seed,
+    )  # fmt: skip
     run_memorize(data or [], plan, PictureOptions(depth, depth_model, fov, size), out, json)
 
 
@@ -335,12 +349,16 @@ def rollout(
     persist rollout --start sample#0:32 --actions "left*4 forward*6" --out runs/rollout
     """
     from persist_cli.rollout.camera_path import RolloutPlan
+    from persist_cli.rollout.open_world import WorldOptions
     from persist_cli.rollout.rollout import run_rollout
 
+    world = WorldOptions(
+        start=start, memory=memory, adapter=adapter, write=write, seed=seed, body=body,
+        sampling=SamplingOverrides(steps, sampler, guidance, context_noise),
+        placement=InferenceOptions.of(dtype, save_memory),
+    )  # fmt: skip
     plan = RolloutPlan(
-        start=start, actions=tuple(actions or ()), follow=follow, frames=frames, memory=memory, adapter=adapter,
-        write=write, seed=seed, sampling=SamplingOverrides(steps, sampler, guidance, context_noise),
-        placement=InferenceOptions.of(dtype, save_memory), step=step, turn=turn, body=body,
+        world=world, actions=tuple(actions or ()), follow=follow, frames=frames, step=step, turn=turn
     )  # fmt: skip
     run_rollout(checkpoint, plan, out, json)
 
@@ -422,29 +440,3 @@ def doctor(
     from persist_cli.doctor.machine import machine_of
 
     run_doctor(recipe, overrides or [], machine_of(gpus, gpu_memory), fsdp, json)
-
-
-@app.command()
-def plugins(json: JsonOption = False) -> None:
-    """List every plugin: backbones, memories, encoders, simulators, importers, policies, costs, scene models."""
-    from persist_cli.viewing.listings import show_plugins
-
-    show_plugins(json)
-
-
-@app.command()
-def recipes(
-    name: Annotated[str | None, typer.Argument(help="A recipe, or a YAML file, to show with every setting.")] = None,
-    json: JsonOption = False,
-) -> None:
-    """List the recipes that come with persist, or show one with every setting, as YAML to start from.
-
-    persist recipes tiny-stage1 > mine.yaml
-    """
-    if name is None:
-        from persist_cli.viewing.listings import show_recipes
-
-        return show_recipes(json)
-    from persist_cli.viewing.recipe_page import show_recipe
-
-    show_recipe(name, json)

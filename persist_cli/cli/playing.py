@@ -97,9 +97,9 @@ def play(
     given = (SAMPLE_FRAMES,) if start is None and not memory else tuple(memory or ())
     begin = StartOptions(start or SAMPLE_START, PictureOptions(depth, depth_model, fov, None), step, turn, body)
     options = PlayOptions(
-        checkpoint or REFERENCE, begin, split_names(memories), given,
-        PlaySettings(steps or 1, guidance, seed, ahead, clip_frames), InferenceOptions.of(dtype, save_memory),
-        own_steps=steps is None,
+        checkpoint=checkpoint or REFERENCE, begin=begin, memories=split_names(memories), given=given,
+        settings=PlaySettings(steps=steps or 1, guidance=guidance, seed=seed, ahead=ahead, clip_frames=clip_frames),
+        placement=InferenceOptions.of(dtype, save_memory), own_steps=steps is None,
     )  # fmt: skip
-    opens = not json if browser is None else browser
-    run_play(options, ServeOptions(host, port, Limits(sessions, fps), out, opens, json))
+    opens, limits = (not json if browser is None else browser), Limits(sessions, fps)
+    run_play(options, ServeOptions(host=host, port=port, limits=limits, recordings=out, browser=opens, json=json))

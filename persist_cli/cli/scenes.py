@@ -96,6 +96,7 @@ def edit(
     if checkpoint is None:
         refuse_options(context, "adapter steps sampler guidance", "only with --checkpoint, whose model imagines a view")
     sampling = SamplingOverrides(steps, sampler, guidance)
-    imagination = None if checkpoint is None else Imagination(checkpoint, adapter, sampling, seed)
+    model = None if checkpoint is None else Imagination(checkpoint, adapter, sampling, seed)
     written = tuple(WrittenEdit(*edit) for edit in context.obj)
-    return run_edit(EditPlan(memory, written, overwrite, seed, camera, imagination), out, save_edits, json)
+    plan = EditPlan(memory=memory, written=written, overwrite=overwrite, seed=seed, camera=camera, imagination=model)
+    return run_edit(plan, out, save_edits, json)

@@ -50,5 +50,8 @@ def view(
     if export is not None:
         unused = "out checkpoint adapter seed host port"
         refuse_options(context, unused, "not with --export, which writes a page that edits and imagines nothing")
-    plan = ViewPlan(source, truth, start, ImagineSettings(checkpoint, adapter, seed), out, most, seed)
+    plan = ViewPlan(
+        source=source, truth=truth, start=start, imagine=ImagineSettings(checkpoint, adapter, seed), out=out, most=most,
+        seed=seed,
+    )  # fmt: skip
     run_view(plan, Address(host, port, opens), export, json)

@@ -24,7 +24,7 @@ from persist_cli.data.writing_noise import NO_ERRORS, WritingNoise
 from persist_cli.errors import DataError, RecipeError
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ClipPlan:
     """Settings of the clips that a ``ClipDataset`` draws.
 

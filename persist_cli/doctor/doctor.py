@@ -120,7 +120,9 @@ class Doctor:
     def launch(self, strategy: Strategy) -> Launch:
         """The processes that the training is spread over with these changes."""
         sharded, offloaded = self.sharded or strategy.sharded, OFFLOADED in strategy.flags
-        return Launch(self.machine.devices, self.machine.kind == "cuda", sharded, offloaded)
+        return Launch(
+            devices=self.machine.devices, cuda=self.machine.kind == "cuda", sharded=sharded, offloaded=offloaded
+        )
 
     def estimator(self, recipe: Recipe) -> Estimator:
         """The estimator for the recipe's parameters, which only LoRA changes."""

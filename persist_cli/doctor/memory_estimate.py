@@ -25,7 +25,7 @@ MOMENTS: Final = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Launch:
     """The processes that a training is spread over.
 
@@ -113,7 +113,7 @@ class Estimator(ABC):
         """The memory that one process of a training needs."""
         training = recipe.training
         batch = training.samples_at_once(launch.devices)
-        kind = StepKind(batch, launch.cuda, launch.sharded and training.precision == "bf16")
+        kind = StepKind(batch=batch, cuda=launch.cuda, sharded=launch.sharded and training.precision == "bf16")
         encoding, step = self.encoding(recipe, kind).peak, self.step(recipe, kind)
         without_step = self.without_step(recipe, launch)
         return dataclasses.replace(without_step, encoding=encoding, activations=step.peak, shallow=step.shallow)

@@ -30,7 +30,7 @@ from persist_cli.train.optimizer import requested_savings
 SHALLOW, DEEPER = 2, 4  # groups of layers; a single group would be first and last at once
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class StepKind:
     """A kind of step, which decides on its bytes together with backbone and recipe.
 

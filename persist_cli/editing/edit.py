@@ -42,7 +42,7 @@ FILLED = {  # by ``EditOutcome.filled_by``
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class EditPlan:
     """The options of ``persist edit``; see its help.
 

@@ -18,7 +18,7 @@ from persist_cli.api.cell_rays import first_surfaces
 from persist_cli.api.cells import CellGrid
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.geometry import unproject
-from persist_cli.api.inference import InferenceOptions, SamplingOverrides
+from persist_cli.api.inference import SamplingOverrides
 from persist_cli.api.memory import FrameOfReference, Memory
 from persist_cli.data.clips import interactions_of
 from persist_cli.data.reference import Reference, parse_reference
@@ -26,8 +26,7 @@ from persist_cli.data.store import TrajectoryFile
 from persist_cli.editing.locality import edited_pixels, flat_cells
 from persist_cli.errors import DataError
 from persist_cli.io.files import written_aside
-from persist_cli.rollout.camera_path import RolloutPlan
-from persist_cli.rollout.open_world import assemble_world
+from persist_cli.rollout.open_world import WorldOptions, assemble_world
 from persist_cli.viewing.console import busy
 from persist_cli.viewing.video import below, beside, enlarge, labelled
 
@@ -167,11 +166,12 @@ def imagined_before_and_after(imagination: Imagination, text: str, file: Path, e
         PersistError: when model, memory and data do not go together.
     """
     source, frames = frames_of(parse_reference(text), text)
-    plan = RolloutPlan(
-        text, (), True, 0, file, imagination.adapter, False, imagination.seed, imagination.sampling, InferenceOptions()
-    )
+    options = WorldOptions(
+        start=text, memory=file, adapter=imagination.adapter, write=False, seed=imagination.seed,
+        sampling=imagination.sampling, body=False,
+    )  # fmt: skip
     checkpoint = find_checkpoint(imagination.checkpoint)
-    world = assemble_world(checkpoint, checkpoint.chosen_adapter(imagination.adapter), plan, source.info)
+    world = assemble_world(checkpoint, checkpoint.chosen_adapter(imagination.adapter), options, source.info)
     if len(frames) == 1:
         frames = range(max(0, frames.start - world.clip_frames + 1), frames.stop)
     if len(frames) < 2:

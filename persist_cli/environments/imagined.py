@@ -13,7 +13,7 @@ import numpy as np
 
 from persist_cli.api.checkpoint import REFERENCE, find_checkpoint
 from persist_cli.api.ground import GroundMap
-from persist_cli.api.inference import InferenceOptions, SamplingOverrides
+from persist_cli.api.inference import SamplingOverrides
 from persist_cli.api.memory_file import is_memory_file
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.environments.environment import HouseEnv, HouseVectorEnv, Scenes
@@ -23,8 +23,8 @@ from persist_cli.errors import CheckpointError, DataError
 from persist_cli.io.settings import parse_settings
 from persist_cli.navigation.ground_mapper import GroundMapper, body_of, knows_floor
 from persist_cli.navigation.routes import check_within_reach
-from persist_cli.rollout.camera_path import RolloutPlan, walking_vocabulary
-from persist_cli.rollout.open_world import assemble_world
+from persist_cli.rollout.camera_path import walking_vocabulary
+from persist_cli.rollout.open_world import WorldOptions, assemble_world
 from persist_cli.rollout.world_model import SEEDS, Agent, WorldModel
 
 NAME: Final = "persist/ImaginedHouse-v0"
@@ -187,15 +187,15 @@ def open_house(settings: ImaginedSettings, starts: PosedFrames) -> tuple[WorldMo
     """Return a world model with one agent, which has not begun, and the start's info with the actions to take."""
     checkpoint = find_checkpoint(Path(settings.checkpoint))
     adapter = checkpoint.chosen_adapter(settings.adapter)
-    plan = RolloutPlan(
-        settings.start, (), False, 0, settings.memory_file, settings.adapter, settings.write, 0,
-        settings.sampling, InferenceOptions(), settings.step, settings.turn,
-        body=settings.collide,
-    )  # fmt: skip
-    info = replace(starts.info, vocabulary=walking_vocabulary(starts.file, plan))
+    vocabulary = walking_vocabulary(starts.file, settings.start, settings.step, settings.turn)
+    info = replace(starts.info, vocabulary=vocabulary)
     if adapter is None and settings.memory is not None:
         raise CheckpointError(f"{checkpoint.folder}: without a memory adapter it cannot read {settings.memory}")
-    return assemble_world(checkpoint, adapter, plan, info), info
+    options = WorldOptions(
+        start=settings.start, memory=settings.memory_file, adapter=settings.adapter, write=settings.write,
+        sampling=settings.sampling, body=settings.collide,
+    )  # fmt: skip
+    return assemble_world(checkpoint, adapter, options, info), info
 
 
 def memorize_frames(world: WorldModel, frames: PosedFrames) -> None:

@@ -48,7 +48,7 @@ class SimulatedSettings(TaskSettings):
     def plan(self) -> CollectPlan:
         """Return the plan of a collection of the same scenes, checked."""
         scenes = f"{self.scenes}:{int(self.scenes) + 1}" if self.scenes.isdecimal() else self.scenes
-        plan = CollectPlan(self.simulator, scenes, size=self.size, split=self.split)
+        plan = CollectPlan(simulator=self.simulator, scenes=scenes, size=self.size, split=self.split)
         plan.check()
         return plan
 

@@ -38,7 +38,7 @@ SIGHTS: Final = {"both": (True, False), "in-sight": (True,), "hidden": (False,)}
 Kind = tuple[int, bool]  # the bin, and whether the goal is in sight
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class EpisodeSearch:
     """Which episodes are wanted.
 

@@ -45,7 +45,7 @@ MANY = 1_000_000  # actions after which nothing is left of a plan
 DECISIONS = 100_000  # more than an episode has, so that no two decisions of all episodes share a seed
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PlanSettings:
     """How all rows that imagine plan.
 

@@ -36,7 +36,7 @@ it: the difference to a row with a memory is what the model's memory is worth.""
 Planning = Literal["policy", "rank", "cem"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PlanningRow:
     """One row of the tables.
 
@@ -143,10 +143,15 @@ class RowChoice:
 
     def _rows_of(self, name: str, memories: Sequence[str]) -> Iterator[PlanningRow]:
         if name in POLICIES:
-            yield PlanningRow(name, "policy", self.policy, None, self.goal, name == POLICY_WALK)
+            yield PlanningRow(
+                name=name, planner="policy", policy=self.policy, memory=None, goal=self.goal, walk=name == POLICY_WALK
+            )
         elif name in ALONE:
             alone, goal, walk = ALONE[name]
-            yield PlanningRow(name, "policy", alone, None, goal or self.goal, walk, retrieves=name == RETRIEVAL)
+            yield PlanningRow(
+                name=name, planner="policy", policy=alone, memory=None, goal=goal or self.goal, walk=walk,
+                retrieves=name == RETRIEVAL,
+            )  # fmt: skip
         elif named := IMAGINING.fullmatch(name):
             yield from self._imagining(named, memories)
 
@@ -164,4 +169,7 @@ class RowChoice:
         planner: Planning = "rank" if named["count"] else "cem"
         for memory in given:
             walk = named["walk"] is not None or memory not in FORGETFUL
-            yield PlanningRow(f"{named[0]}, {memory}", planner, policy, memory, self.goal, walk, count)
+            yield PlanningRow(
+                name=f"{named[0]}, {memory}", planner=planner, policy=policy, memory=memory, goal=self.goal, walk=walk,
+                candidates=count,
+            )  # fmt: skip

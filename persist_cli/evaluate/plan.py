@@ -47,7 +47,7 @@ from persist_cli.metrics.metric import Metric
 from persist_cli.viewing.console import busy, warn
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class EvalPlan:
     """The options of ``persist eval``; see its help.
 
@@ -79,7 +79,7 @@ class EvalPlan:
         return replace(self, data=tuple(data.values()), memories=tuple(dict.fromkeys(self.memories or ())))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Evaluation:
     """An evaluation that was checked and is ready to be measured.
 
@@ -155,9 +155,7 @@ def prepare(
     with busy("loading the models"):
         bases = check_bases(checkpoints, plan.data, [sampling, *config.sampling_of.values()], loader)
     models = build_model_rows(checkpoints, config, protocol)  # unknown memories are reported before clips are sought
-    search = ClipSearch(
-        plan.data, plan.frames, plan.clips, bases.frames_per_clip - 1, scenes_to_avoid(checkpoints), plan.new_poses
-    )
+    search = clip_search(plan, checkpoints, bases.frames_per_clip - 1)
     journal = Journal(out)
     if processes.main:
         values = identity(plan, sampling, checkpoints, metrics)
@@ -183,14 +181,26 @@ def prepare(
     for row in [*rows, *(row for row, _ in controls.missing)]:
         row.has_depth = not (row.uses_model and row.base.fingerprint in bases.depthless)
     suites = [MetricSuite(metrics, make_setup(cases, row.has_depth, search.predicted_at_once)) for row in rows]
-    return Evaluation(plan, sampling, checkpoints, protocol, cases, rows, controls.missing, suites, journal), loader
+    return Evaluation(
+        plan=plan, sampling=sampling, checkpoints=checkpoints, protocol=protocol, cases=cases, rows=rows,
+        missing=controls.missing, suites=suites, journal=journal,
+    ), loader  # fmt: skip
+
+
+def clip_search(plan: EvalPlan, checkpoints: Sequence[Checkpoint], predicted_at_once: int) -> ClipSearch:
+    """Where and how long the clips of an evaluation are looked for, of models that predict some frames at once."""
+    return ClipSearch(
+        folders=plan.data, frames=plan.frames, limit=plan.clips, predicted_at_once=predicted_at_once,
+        training_scenes=scenes_to_avoid(checkpoints), new_poses=plan.new_poses,
+    )  # fmt: skip
 
 
 def row_config(plan: EvalPlan, sampling: Sampling) -> RowConfig:
     """Which rows are built and how they are sampled; raises ``PersistError`` for what cannot be."""
     config = RowConfig(
-        plan.memories or (), plan.controls, sampling, plan.noise, plan.controls_named, plan.training_seeds,
-        {memory: replace(sampling, **own.requested()) for memory, own in plan.sampling_of.items()},
+        memories=plan.memories or (), controls=plan.controls, sampling=sampling, noise=plan.noise,
+        named=plan.controls_named, training_seeds=plan.training_seeds,
+        sampling_of={memory: replace(sampling, **own.requested()) for memory, own in plan.sampling_of.items()},
     )  # fmt: skip
     config.check()
     return config

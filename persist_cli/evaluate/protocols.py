@@ -44,7 +44,7 @@ START_STRIDE = 4  # frames between the starts of clips that are tried
 LEAST_LONG_FRAMES = 112  # frames to predict, as in the paper
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ClipSearch:
     """Where a protocol looks for clips, and how long and how many they are.
 

@@ -21,7 +21,8 @@ from persist_cli.errors import PersistError
 from persist_cli.plugins import make_cost
 from persist_cli.viewing.console import watched
 
-ROW = PlanningRow("policy", "policy", None, None, "image", False)  # shown the goal image, given nothing else
+# shown the goal image, given nothing else
+ROW = PlanningRow(name="policy", planner="policy", policy=None, memory=None, goal="image", walk=False)
 
 # of 0.05 to 0.3: most success of the packaged policy in 124 episodes of 10 validation houses
 STOP_COST: Final = 0.17  # LPIPS

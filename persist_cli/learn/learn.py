@@ -42,8 +42,7 @@ from persist_cli.plugins import make_policy, make_settings
 from persist_cli.policies.open_policy import acting_settings, open_policy
 from persist_cli.policies.trained import TrainedPolicy, find_policy, packaged_policy
 from persist_cli.recipe import apply_overrides, make_recipe
-from persist_cli.rollout.camera_path import RolloutPlan
-from persist_cli.rollout.open_world import assemble_world
+from persist_cli.rollout.open_world import WorldOptions, assemble_world
 from persist_cli.train.finetune import FinetunePlan, run_finetune
 from persist_cli.train.sources import weights_hash
 from persist_cli.viewing.console import add_task, print_json, print_table, progress, say
@@ -59,7 +58,7 @@ MODEL, SIMULATOR = "model", "simulator"  # where a policy may practise
 LOOK: Final = ("light", "gains", "depth_sensor")  # of a collecting camera, which the true house has not
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class LearnPlan:
     """The options of ``persist learn``.
 
@@ -103,7 +102,7 @@ class LearnPlan:
     allow_training_scenes: bool = False
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Learning:
     """A plan that was checked, with all that a round needs.
 
@@ -191,7 +190,7 @@ def prepare(plan: LearnPlan, out: Path) -> Learning:
         check_held_out(plan, begin, info.scene)
     check_horizon(plan, begin)
     make_recipe(apply_overrides(recipe_of_round(plan, begin, 1), plan.training), "--set")
-    learning = Learning(plan, out, info, views, begin, simulator, episodes)
+    learning = Learning(plan=plan, out=out, info=info, views=views, begin=begin, simulator=simulator, episodes=episodes)
     check_plan(learning)
     return learning
 
@@ -317,11 +316,11 @@ def open_place(learning: Learning) -> PracticePlace:
         return TruePlace(learning.simulator, info)
     checkpoint = find_checkpoint(plan.checkpoint)
     adapter = checkpoint.chosen_adapter(plan.adapter)
-    rollout = RolloutPlan(
-        start=plan.views[0], actions=(), follow=False, frames=0, memory=None, adapter=plan.adapter, write=True,
-        seed=plan.seed, sampling=plan.sampling, placement=plan.placement, body=plan.body,
+    options = WorldOptions(
+        start=plan.views[0], adapter=plan.adapter, seed=plan.seed, sampling=plan.sampling, placement=plan.placement,
+        body=plan.body,
     )  # fmt: skip
-    world = assemble_world(checkpoint, adapter, rollout, info)
+    world = assemble_world(checkpoint, adapter, options, info)
     world.agents[0].memorize(learning.views, world.backbone.device)
     origin = {"model": checkpoint.fingerprint, "adapter": adapter or PLAIN}
     return ImaginedPlace(world, info, origin)
@@ -373,7 +372,7 @@ def train(learning: Learning, number: int) -> None:
     if not file.is_file():
         write_text(file, yaml.safe_dump(recipe, sort_keys=False))
     data = [learning.folder(one) / "walks" for one in range(1, number + 1)]
-    run_finetune(FinetunePlan(str(file), plan.training, data, run, resume=True))
+    run_finetune(FinetunePlan(recipe=str(file), overrides=plan.training, data=data, out=run, resume=True))
 
 
 def evaluate(learning: Learning, number: int) -> None:

@@ -29,7 +29,7 @@ from persist_cli.plugins import make_cost
 from persist_cli.rollout.world_model import SEEDS
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PracticeSettings:
     """How a policy practises.
 

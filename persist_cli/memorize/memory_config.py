@@ -22,7 +22,7 @@ USUAL = "voxel"  # the memory when neither the user nor a checkpoint names one
 SCENE = "scene"  # the memory when a model is named that imagines
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class MemorizePlan:
     """The options of ``persist memorize`` about the memory.
 

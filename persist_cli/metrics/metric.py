@@ -55,7 +55,7 @@ class Prediction:
             raise DataError(f"{where}: first visits must name an earlier frame, or -1, for each of {len(self.rgb)}")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Setup:
     """Properties of the clips and the model that decide whether a metric can be measured.
 

@@ -34,8 +34,8 @@ from persist_cli.planning.outputs import Planned, write_plan
 from persist_cli.planning.planners import Cem, CemSettings, OnRound, Plan, Rank, RankSettings, action_names
 from persist_cli.plugins import make_cost
 from persist_cli.policies.open_policy import open_policy
-from persist_cli.rollout.camera_path import RolloutPlan, walking_vocabulary
-from persist_cli.rollout.open_world import assemble_world
+from persist_cli.rollout.camera_path import walking_vocabulary
+from persist_cli.rollout.open_world import WorldOptions, assemble_world
 from persist_cli.rollout.surroundings import Surroundings
 from persist_cli.rollout.world_model import Agent, WorldModel
 from persist_cli.viewing.console import add_task, busy, print_json, print_table, progress, say, warn
@@ -45,7 +45,7 @@ OVER: dict[str, Over] = {"last": "last", "best": "best"}
 SHOWN = 5  # candidates in the terminal's table and on the sheet
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PlanOptions:
     """The options of ``persist plan``; see its help.
 
@@ -78,16 +78,15 @@ class PlanOptions:
     turn: float | None = None
 
     @property
-    def rollout(self) -> RolloutPlan:
-        """The same options as a rollout's, which a world model is put together by."""
-        return RolloutPlan(
-            start=self.start, actions=(), follow=False, frames=0, memory=self.memory, adapter=self.adapter, write=True,
-            seed=self.seed, sampling=self.sampling, placement=self.placement, step=self.step, turn=self.turn,
-            body=self.body,
+    def world(self) -> WorldOptions:
+        """Those of the options that a world model is put together with."""
+        return WorldOptions(
+            start=self.start, memory=self.memory, adapter=self.adapter, seed=self.seed, sampling=self.sampling,
+            placement=self.placement, body=self.body,
         )  # fmt: skip
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PlanParts:
     """What a plan is made with, checked before a model is loaded.
 
@@ -141,7 +140,7 @@ def plan_parts(options: PlanOptions) -> PlanParts:
     """
     reference = parse_reference(options.start)
     file = reference.single()
-    vocabulary = walking_vocabulary(file, options.rollout)
+    vocabulary = walking_vocabulary(file, options.start, options.step, options.turn)
     start = file.read([reference.frame])
     start = dataclasses.replace(start, info=dataclasses.replace(start.info, vocabulary=vocabulary))
     budget = Budget(options.frames, options.seconds)
@@ -157,7 +156,10 @@ def plan_parts(options: PlanOptions) -> PlanParts:
     check_goal(goal, cost, policy)
     first = max(0, reference.frame + 1 - (policy.frames if policy is not None else 1))
     seen = file.read(range(first, reference.frame + 1)).observations
-    return PlanParts(start, seen, goal, planner, policy, cost, budget, OVER[options.over])
+    return PlanParts(
+        start=start, seen=seen, goal=goal, planner=planner, policy=policy, cost=cost, budget=budget,
+        over=OVER[options.over],
+    )  # fmt: skip
 
 
 def chosen_policy(options: PlanOptions, settings: dict[str, Any]) -> Policy | None:
@@ -196,7 +198,7 @@ def chosen_planner(options: PlanOptions, policy: Policy | None, settings: dict[s
 
 def open_model(checkpoint: Checkpoint, adapter: str | None, options: PlanOptions, start: Trajectory) -> WorldModel:
     """Return the world model with its agent at the start frame."""
-    model = assemble_world(checkpoint, adapter, options.rollout, start.info)
+    model = assemble_world(checkpoint, adapter, options.world, start.info)
     model.reset([start.observations], [start.info])
     return model
 

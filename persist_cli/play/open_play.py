@@ -26,7 +26,7 @@ from persist_cli.rollout.world_model import Agent
 from persist_cli.viewing.console import busy
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PlayOptions:
     """What is walked in.
 
@@ -84,7 +84,7 @@ def open_walks(options: PlayOptions) -> Callable[[], Play]:
         backbone = _load(checkpoint, names)
     backbone.prepare_inference(options.placement)
     placed = {name: memory and memory.to(backbone.device) for name, memory in memories.items()}
-    sampling, body = checkpoint.sampling_with(SamplingOverrides()), body_for(options.begin.plan, start.info)
+    sampling, body = checkpoint.sampling_with(SamplingOverrides()), body_for(options.begin.world, start.info)
     settings = options.settings
     if options.own_steps and sampling.sampler == CONSISTENCY:
         settings = replace(settings, steps=sampling.steps)
@@ -140,8 +140,7 @@ def _memory(checkpoint: Checkpoint, name: str, options: PlayOptions, start: Traj
         raise CheckpointError(
             f"{files[1]}: a second memory of kind {kind!r}; give one, or `persist memorize --merge` them"
         )
-    plan = replace(options.begin.plan, memory=files[0] if files else None)
-    return open_memory(checkpoint, name, plan, start.info)
+    return open_memory(checkpoint, name, replace(options.begin.world, memory=files[0] if files else None), start.info)
 
 
 def _memorize(sources: Sequence[Source], memories: dict[str, Memory | None], start: Trajectory) -> None:

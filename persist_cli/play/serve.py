@@ -27,7 +27,7 @@ LAST_CALL_SECONDS: Final = 1.0  # that a call to the model may still take when t
 SAVING_SECONDS: Final = 120.0  # the same, where a recording is saved; a full one takes a minute or more
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ServeOptions:
     """Where the page is served, and to how many.
 

@@ -19,7 +19,7 @@ Picture = UInt8[Tensor, "height width 3"]
 GROWTH: Final = (2, 3, 5)  # frames of the first clips under newly held keys, the present one included
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PlaySettings:
     """How frames are imagined while somebody walks.
 

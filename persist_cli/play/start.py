@@ -6,7 +6,6 @@ import tempfile
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.memory_file import is_memory_file
 from persist_cli.api.observations import Trajectory
 from persist_cli.data.reference import parse_reference
@@ -14,7 +13,8 @@ from persist_cli.data.store import Store
 from persist_cli.errors import DataError
 from persist_cli.memorize.picture import PictureOptions, is_picture, refuse_picture_options, write_picture
 from persist_cli.play.memory_start import memory_start
-from persist_cli.rollout.camera_path import RolloutPlan, walking_vocabulary
+from persist_cli.rollout.camera_path import walking_vocabulary
+from persist_cli.rollout.open_world import WorldOptions
 
 SAMPLE_START = "sample#0:32"  # where a walk begins when nothing is named
 SAMPLE_FRAMES = "sample#0:0-33"  # and what is remembered there
@@ -39,12 +39,9 @@ class StartOptions:
     body: bool | None = None
 
     @property
-    def plan(self) -> RolloutPlan:
-        """The same options as a rollout's."""
-        return RolloutPlan(
-            start=self.start, actions=(), follow=False, frames=0, memory=None, adapter=None, write=True, seed=0,
-            sampling=SamplingOverrides(), placement=InferenceOptions(), step=self.step, turn=self.turn, body=self.body,
-        )  # fmt: skip
+    def world(self) -> WorldOptions:
+        """Those of the options that a world model is put together with."""
+        return WorldOptions(start=self.start, body=self.body)
 
 
 def read_start(
@@ -70,7 +67,8 @@ def read_start(
     reference = parse_reference(options.start)
     file = reference.single()
     start = file.read([reference.frame])
-    return replace(start, info=replace(start.info, vocabulary=walking_vocabulary(file, options.plan)))
+    vocabulary = walking_vocabulary(file, options.start, options.step, options.turn)
+    return replace(start, info=replace(start.info, vocabulary=vocabulary))
 
 
 _FORMS = "DATA#trajectory:frame, a picture with --depth FILE, or a memory file"

@@ -44,7 +44,7 @@ Gain = tuple[float | None, float | None, float | None]  # mean, low and high
 Gains = dict[str, Gain]  # by column
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Plan:
     """What is trained and measured.
 
@@ -348,8 +348,8 @@ def main(arguments: Sequence[str]) -> None:
     recipes = chosen_recipes([name for name in options.only.split(",") if name])
     data, held_out = options.data or default_data(options.out), options.held_out or default_held_out(options.out)
     plan = Plan(
-        options.out, options.samples, recipes, options.base, tuple(data), tuple(held_out), options.clips, options.seed,
-        tuple(options.set),
+        out=options.out, samples=options.samples, recipes=recipes, base=options.base, data=tuple(data),
+        held_out=tuple(held_out), clips=options.clips, seed=options.seed, settings=tuple(options.set),
     )  # fmt: skip
     run_ablations(plan, options.houses)
 

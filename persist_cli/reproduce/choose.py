@@ -84,7 +84,7 @@ GUIDANCES: Final = (1.0, 1.5, 2.0)  # tried first, with the other settings of FI
 STEPS: Final = ((4, "ddim"), (10, "unipc"), (10, "ddim"), (20, "unipc"))  # tried then, with the best guidance
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Plan:
     """What is trained and measured.
 
@@ -384,7 +384,11 @@ def main(arguments: Sequence[str]) -> None:
     memories = memories_of(options.memories)
     for memory in memories:
         make_recipe(read_recipe(f"{RECIPE}{memory}"), f"{RECIPE}{memory}")
-    run_choose(Plan(options.out, options.base, tuple(options.data), validation, memories, options.steps, options.clips))
+    plan = Plan(
+        out=options.out, base=options.base, data=tuple(options.data), validation=validation, memories=memories,
+        steps=options.steps, clips=options.clips,
+    )  # fmt: skip
+    run_choose(plan)
 
 
 if __name__ == "__main__":

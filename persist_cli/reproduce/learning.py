@@ -51,7 +51,7 @@ CHANGE: Final = "after − before"
 ADVANTAGE: Final = "after − after with the memory compared with"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Plan:
     """What is learned and where.
 
@@ -301,8 +301,8 @@ def parse(arguments: Sequence[str]) -> Plan:
     if not memories or min(given.houses, given.views, given.rounds) < 1:
         raise PersistError("--memories, --houses, --views and --rounds must be at least one each")
     return Plan(
-        given.out, given.model, given.policy, memories, given.houses, given.first, given.views, given.rounds,
-        given.options,
+        out=given.out, model=given.model, policy=given.policy, memories=memories, houses=given.houses,
+        first=given.first, views=given.views, rounds=given.rounds, options=given.options,
     )  # fmt: skip
 
 

@@ -64,7 +64,7 @@ TRUE_AGENTS: Final = 4  # that are measured together
 MEASURED: Final = 1_000_000  # seed of the episodes that are measured; no learning begins with it
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Plan:
     """What is learned and where.
 
@@ -203,7 +203,8 @@ def learn(learning: Learning) -> None:
 def images_of(learning: Learning) -> str:
     """Return the given frames of a house; of one alone its mean depth is the largest: as much as one image can show."""
     views = learning.plan.out / VIEWS
-    [seed] = CollectPlan("miniworld", f"{learning.house}:{learning.house + 1}", split="test").generator_seeds
+    scenes = f"{learning.house}:{learning.house + 1}"
+    [seed] = CollectPlan(simulator="miniworld", scenes=scenes, split="test").generator_seeds
     file = next(file for file in Store(views) if file.info.source["house"] == seed)
     if learning.plan.images > 1:
         return f"{views}#{file.name}:0-{learning.plan.images}"
@@ -366,8 +367,9 @@ def parse(arguments: Sequence[str]) -> Plan:
     if not 1 <= given.images <= FRAMES:
         raise PersistError(f"--images {given.images}: give 1 to {FRAMES}, the frames of the walk")
     return Plan(
-        given.out, given.model, given.scene_model, memories, given.houses, given.first, given.seeds, given.steps,
-        given.envs, given.episodes, given.denoising_steps, given.images,
+        out=given.out, model=given.model, scene_model=given.scene_model, memories=memories, houses=given.houses,
+        first=given.first, seeds=given.seeds, steps=given.steps, envs=given.envs, episodes=given.episodes,
+        denoising_steps=given.denoising_steps, images=given.images,
     )  # fmt: skip
 
 

@@ -82,7 +82,7 @@ def choice_plan(out: Path) -> choose.Plan:
     """The choices that are made between the video model and the memories."""
     data = tuple(out / "houses" / policy for policy in POLICIES)
     validation = tuple(out / "validation" / policy for policy in HELD_OUT)
-    return choose.Plan(out / "choices", str(out / "stage1"), data, validation, CHOSEN)
+    return choose.Plan(out=out / "choices", base=str(out / "stage1"), data=data, validation=validation, memories=CHOSEN)
 
 
 def reference_commands(out: Path) -> list[str]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float
@@ -14,38 +13,35 @@ from persist_cli.api.actions import ActionVocabulary, format_actions
 from persist_cli.api.backbone import Interactions
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.ground import Body
-from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.memory import Memory
 from persist_cli.api.observations import Observations, Trajectory, TrajectoryInfo
 from persist_cli.data.clips import interactions_of
 from persist_cli.data.reference import parse_reference
 from persist_cli.data.store import TrajectoryFile
 from persist_cli.errors import DataError, PersistError
+from persist_cli.rollout.open_world import WorldOptions
 from persist_cli.rollout.world_model import cameras_along
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RolloutPlan:
     """The options of ``persist rollout``; see its help.
 
-    ``step`` metres and ``turn`` degrees are those of the walking actions; ``None`` for the trajectory's own. ``body``
-    says whether the agent collides, ``None`` where the height of its camera is told; see ``tells_body``. Along a
-    trajectory's own poses nothing is in its way.
+    Args:
+        world: what is rolled out, and from where.
+        actions: a text of actions for each branch; none with ``follow``.
+        follow: whether the trajectory's own poses are taken, along which nothing is in the way.
+        frames: most of these poses, 0 for all.
+        step: metres of the walking actions, ``None`` for the trajectory's own.
+        turn: their degrees.
     """
 
-    start: str
-    actions: tuple[str, ...]
-    follow: bool
-    frames: int
-    memory: Path | None
-    adapter: str | None
-    write: bool
-    seed: int
-    sampling: SamplingOverrides
-    placement: InferenceOptions
+    world: WorldOptions
+    actions: tuple[str, ...] = ()
+    follow: bool = False
+    frames: int = 0
     step: float | None = None
     turn: float | None = None
-    body: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -110,30 +106,36 @@ class Rollout:
 
 def plan_camera_paths(plan: RolloutPlan) -> list[CameraPath]:
     """Return a camera path for each text of actions, or the one of the trajectory's own poses."""
-    reference = parse_reference(plan.start)
+    reference = parse_reference(plan.world.start)
     file = reference.single()
     if plan.follow:
         if plan.step is not None or plan.turn is not None:
             raise PersistError("--step and --turn are for --actions; --follow takes the trajectory's own poses")
         return [path_of_trajectory(file, reference.frame, plan.frames)]
-    vocabulary = walking_vocabulary(file, plan)
+    vocabulary = walking_vocabulary(file, plan.world.start, plan.step, plan.turn)
     start = file.read([reference.frame])
     start = replace(start, info=replace(start.info, vocabulary=vocabulary))
     return [path_along_actions(start, text) for text in plan.actions]
 
 
-def walking_vocabulary(file: TrajectoryFile, plan: RolloutPlan) -> ActionVocabulary:
-    """Return the actions of a trajectory, with walking actions of the plan's step and turn.
+def walking_vocabulary(file: TrajectoryFile, start: str, step: float | None, turn: float | None) -> ActionVocabulary:
+    """Return the actions of a trajectory, with walking actions of some size where one is given.
+
+    Args:
+        file: the trajectory.
+        start: its frame, as errors name it.
+        step: metres of a walking action; ``None`` with ``turn`` for the trajectory's own actions.
+        turn: degrees of one.
 
     Raises:
-        DataError: when no action moves the camera, as in a capture, and the plan has neither step nor turn.
+        DataError: when no action moves the camera, as in a capture, and neither step nor turn is given.
     """
     own = file.info.vocabulary
-    if plan.step is not None or plan.turn is not None:
-        return own.walking(plan.step, plan.turn)
+    if step is not None or turn is not None:
+        return own.walking(step, turn)
     if not own.can_walk:
         raise DataError(
-            f"{plan.start}: its actions ({', '.join(own.names)}) have no motion of their own, as in every capture; add "
+            f"{start}: its actions ({', '.join(own.names)}) have no motion of their own, as in every capture; add "
             "--step 0.1 --turn 5 (metres and degrees of an action) here, or to `persist import` once for all rollouts"
         )
     return own

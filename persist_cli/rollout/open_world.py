@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,33 @@ from persist_cli.errors import CheckpointError
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.memorize.memory_file import load_memory
 from persist_cli.navigation.ground_mapper import body_of, tells_body
-from persist_cli.rollout.camera_path import RolloutPlan
 from persist_cli.rollout.world_model import Agent, WorldModel
 from persist_cli.viewing.console import busy
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldOptions:
+    """What a world model is put together with, beside its checkpoint and the data of its start.
+
+    Args:
+        start: the frame at which its agent begins, as errors name it.
+        memory: a file that ``persist memorize`` wrote; an empty memory when ``None``.
+        adapter: the memory adapter that was asked for by name; ``None`` where none was.
+        write: whether what is imagined is written into the memory.
+        seed: seed of the sampling noise.
+        sampling: steps, sampler and guidance in place of the checkpoint's own.
+        placement: precision and memory savings.
+        body: whether walls stop the agent; ``None``: where the height of its camera is told, see ``tells_body``.
+    """
+
+    start: str
+    memory: Path | None = None
+    adapter: str | None = None
+    write: bool = True
+    seed: int = 0
+    sampling: SamplingOverrides = field(default_factory=SamplingOverrides)
+    placement: InferenceOptions = field(default_factory=InferenceOptions)
+    body: bool | None = None
 
 
 def open_world(
@@ -51,35 +76,37 @@ def open_world(
     """
     reference, found = parse_reference(start), find_checkpoint(Path(checkpoint))
     frame = reference.single().read([reference.frame])
-    plan = RolloutPlan(
-        start, (), False, 0, None if memory is None else Path(memory), adapter, True, seed,
-        sampling or SamplingOverrides(), InferenceOptions(),
+    options = WorldOptions(
+        start=start, memory=None if memory is None else Path(memory), adapter=adapter, seed=seed,
+        sampling=sampling or SamplingOverrides(),
     )  # fmt: skip
-    world = assemble_world(found, found.chosen_adapter(adapter), plan, frame.info)
+    world = assemble_world(found, found.chosen_adapter(adapter), options, frame.info)
     world.reset([frame.observations], [frame.info])
     return world
 
 
-def assemble_world(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, info: TrajectoryInfo) -> WorldModel:
+def assemble_world(
+    checkpoint: Checkpoint, adapter: str | None, options: WorldOptions, info: TrajectoryInfo
+) -> WorldModel:
     """Return a world model with one agent, which has not begun yet.
 
     Args:
         checkpoint: the checkpoint.
         adapter: name of its adapter, ``None`` for the model without one.
-        plan: start, memory, seed, sampling and placement.
+        options: memory, seed, sampling and placement.
         info: scene, up axis and image size of the start frame's trajectory.
 
     Raises:
         PersistError: when model, memory, sampling and data do not go together.
     """
     with busy("loading the memory"):  # before the model, which takes longer, so that what cannot work fails at once
-        memory = open_memory(checkpoint, adapter, plan, info)
+        memory = open_memory(checkpoint, adapter, options, info)
     with busy("loading the model"):
-        return world_with(memory, checkpoint, adapter, plan, info)
+        return world_with(memory, checkpoint, adapter, options, info)
 
 
 def world_with(
-    memory: Memory | None, checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, info: TrajectoryInfo
+    memory: Memory | None, checkpoint: Checkpoint, adapter: str | None, options: WorldOptions, info: TrajectoryInfo
 ) -> WorldModel:
     """Return a world model whose one agent has a memory that is loaded already, and show no progress.
 
@@ -87,45 +114,49 @@ def world_with(
         memory: what the agent remembers; it is moved to the model's device.
         checkpoint: the checkpoint.
         adapter: name of its adapter, ``None`` for the model without one.
-        plan: start, seed, sampling and placement.
+        options: seed, sampling and placement.
         info: scene, up axis and image size of the start frame's trajectory.
 
     Raises:
         PersistError: when model, sampling and data do not go together.
     """
-    check_size(info, empty_backbone(checkpoint).image_size, plan.start)
+    check_size(info, empty_backbone(checkpoint).image_size, options.start)
     backbone = load_backbone(checkpoint, adapter=adapter)
-    sampling = checkpoint.sampling_with(plan.sampling)
+    sampling = checkpoint.sampling_with(options.sampling)
     backbone.check_sampling(sampling)
-    backbone.prepare_inference(plan.placement)
-    agent = Agent(memory and memory.to(backbone.device), plan.seed, plan.write, body=body_for(plan, info))
+    backbone.prepare_inference(options.placement)
+    agent = Agent(memory and memory.to(backbone.device), options.seed, options.write, body=body_for(options, info))
     return WorldModel(backbone, [agent], sampling)
 
 
-def body_for(plan: RolloutPlan, info: TrajectoryInfo) -> Body | None:
-    """Return the body of a plan's agent, ``None`` for a camera that nothing stops."""
-    collides = not plan.follow and (tells_body(info) if plan.body is None else plan.body)
+def body_for(options: WorldOptions, info: TrajectoryInfo) -> Body | None:
+    """Return the body of a world's agent, ``None`` for a camera that nothing stops."""
+    collides = tells_body(info) if options.body is None else options.body
     return body_of(info) if collides else None
 
 
-def open_memory(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, info: TrajectoryInfo) -> Memory | None:
-    """Return the memory of the plan's file, else an empty one of the adapter's kind, ``None`` without an adapter."""
-    empty = empty_memory(checkpoint, adapter, plan, info)
-    if empty is None or plan.memory is None:
+def open_memory(
+    checkpoint: Checkpoint, adapter: str | None, options: WorldOptions, info: TrajectoryInfo
+) -> Memory | None:
+    """Return the memory of the options' file, else an empty one of the adapter's kind, ``None`` without an adapter."""
+    empty = empty_memory(checkpoint, adapter, options, info)
+    if empty is None or options.memory is None:
         return empty
-    check_memory(read_header(plan.memory), empty, checkpoint, plan.memory)
-    memory = load_memory(plan.memory)
-    check_cells(memory, empty, plan.memory)
+    check_memory(read_header(options.memory), empty, checkpoint, options.memory)
+    memory = load_memory(options.memory)
+    check_cells(memory, empty, options.memory)
     return memory
 
 
-def empty_memory(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, info: TrajectoryInfo) -> Memory | None:
+def empty_memory(
+    checkpoint: Checkpoint, adapter: str | None, options: WorldOptions, info: TrajectoryInfo
+) -> Memory | None:
     """Return an empty memory of the adapter's kind, ``None`` without an adapter, which reads no file."""
     if adapter is not None:
         return MemoryFactory.of(adapter_memory(checkpoint, adapter)).empty(info)
-    if plan.memory is not None:
-        without = f"--adapter {PLAIN} is the model" if plan.adapter else f"{checkpoint.folder}: is a model"
-        raise CheckpointError(f"{without} without a memory adapter, which cannot read {plan.memory}")
+    if options.memory is not None:
+        without = f"--adapter {PLAIN} is the model" if options.adapter else f"{checkpoint.folder}: is a model"
+        raise CheckpointError(f"{without} without a memory adapter, which cannot read {options.memory}")
     return None
 
 

@@ -68,14 +68,19 @@ PRINTED = ("psnr", "lpips-alex", "lpips-vgg")  # figures that the terminal shows
 
 def describe(checkpoint: Checkpoint, adapter: str | None, plan: RolloutPlan, rollout: Rollout) -> dict[str, Any]:
     """Return JSON values that suffice to repeat the rollout, with its figures."""
-    options = {key: str(value) if isinstance(value, Path) else value for key, value in vars(plan).items()}
-    options |= {"sampling": plan.sampling.requested(), "placement": dataclasses.asdict(plan.placement)}
+    world = plan.world
+    options = {
+        "start": world.start, "actions": rollout.path.text, "follow": plan.follow, "frames": plan.frames,
+        "memory": world.memory and str(world.memory), "adapter": adapter, "write": world.write, "seed": world.seed,
+        "sampling": world.sampling.requested(), "placement": dataclasses.asdict(world.placement),
+        "step": plan.step, "turn": plan.turn, "body": world.body,
+    }  # fmt: skip
     memory = dataclasses.asdict(rollout.memory.figures()) if rollout.memory else None
     branches = {"together": list(plan.actions)} if len(plan.actions) > 1 else {}
     return {
         "checkpoint": str(checkpoint.folder),
         "fingerprint": checkpoint.fingerprint,
-        "plan": options | {"adapter": adapter, "actions": rollout.path.text},
+        "plan": options,
         "frames": len(rollout.seen),
         "seconds": rollout.seconds,
         "memory": memory,
@@ -243,7 +248,9 @@ def compare(
     known = Observations.concatenate([start, truth])
     frames, height, width = known.depth.shape
     depth = bool((truth.depth > 0).any())
-    setup = Setup(1, frames - 1, height, width, depth, gives_depth, returns=False)
+    setup = Setup(
+        clips=1, frames=frames - 1, height=height, width=width, depth=depth, generated_depth=gives_depth, returns=False
+    )
     generated = (torch.cat([start.rgb, seen.rgb]), torch.cat([start.depth, seen.depth]))
     prediction = Prediction(*generated, known, torch.full((frames,), -1))
     prediction.check("rollout")

@@ -21,7 +21,7 @@ from persist_cli.errors import PersistError
 from persist_cli.io.files import check_folder
 from persist_cli.memorize.memory_file import add_paths, load_paths
 from persist_cli.rollout.camera_path import CameraPath, Rollout, RolloutPlan, plan_camera_paths
-from persist_cli.rollout.open_world import assemble_world
+from persist_cli.rollout.open_world import WorldOptions, assemble_world
 from persist_cli.rollout.outputs import CARD, blocked_words, counted_words, describe, path_of, summary, write_outputs
 from persist_cli.rollout.world_model import StepResult, WorldModel
 from persist_cli.viewing.console import add_task, busy, print_json, progress, say, warn
@@ -31,22 +31,24 @@ def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, as_json: bool) 
     """Roll out a checkpoint, or the reference model without a path, and write a folder for each branch."""
     if bool(plan.actions) == plan.follow:
         raise PersistError("give either --actions TEXT or --follow")
-    if plan.body is not None and plan.follow:
+    if plan.world.body is not None and plan.follow:
         raise PersistError("--body and --no-body are for --actions; --follow takes the trajectory's own poses")
     if plan.frames and not plan.follow:
         raise PersistError("--frames: only with --follow; with --actions each of them is a frame")
-    check_placement(plan.placement)  # a missing accelerator is an error before anything is loaded
+    check_placement(plan.world.placement)  # a missing accelerator is an error before anything is loaded
     checkpoint = find_checkpoint(path or reference_checkpoint())
-    adapter = checkpoint.chosen_adapter(plan.adapter)
+    adapter = checkpoint.chosen_adapter(plan.world.adapter)
     paths = plan_camera_paths(plan)
     folders = check_folders(out, len(paths))
     warn_of_short_path(plan, paths[0])
     view = unfamiliar_view([paths[0].info], training_scenes(checkpoint))
     if view is not None:
         warn(f"warning: {view}")
-    model = assemble_world(checkpoint, adapter, plan, paths[0].info)
-    plan = dataclasses.replace(plan, sampling=SamplingOverrides(**dataclasses.asdict(model.sampling)))
-    rollouts = [with_paths(plan, rollout) for rollout in roll(model, paths)]
+    options = dataclasses.replace(plan.world, body=False) if plan.follow else plan.world  # nothing stops given poses
+    model = assemble_world(checkpoint, adapter, options, paths[0].info)
+    sampling = SamplingOverrides(**dataclasses.asdict(model.sampling))
+    plan = dataclasses.replace(plan, world=dataclasses.replace(plan.world, sampling=sampling))
+    rollouts = [with_paths(plan.world, rollout) for rollout in roll(model, paths)]
     records = [describe(checkpoint, adapter, plan, rollout) for rollout in rollouts]
     triples = zip(rollouts, folders, records, strict=True)
     with busy("writing videos and maps"):
@@ -79,11 +81,11 @@ def check_folders(out: Path, branches: int) -> list[Path]:
     return folders
 
 
-def with_paths(plan: RolloutPlan, rollout: Rollout) -> Rollout:
+def with_paths(options: WorldOptions, rollout: Rollout) -> Rollout:
     """Return a rollout with the paths of the memory's file, and to be kept also its own if its frames were written."""
-    paths = load_paths(plan.memory) if plan.memory else {}
+    paths = load_paths(options.memory) if options.memory else {}
     remembered = torch.cat([rollout.remembered, *(poses.double() for poses in paths.values())])
-    add_paths(paths, {"rollout": path_of(rollout)} if plan.write else {})
+    add_paths(paths, {"rollout": path_of(rollout)} if options.write else {})
     return dataclasses.replace(rollout, kept_paths=paths, remembered=remembered)
 
 
@@ -91,7 +93,7 @@ def warn_of_short_path(plan: RolloutPlan, path: CameraPath) -> None:
     """Say so when the trajectory has fewer frames to follow than the plan wants."""
     frames = len(path.cameras)
     if plan.follow and frames < plan.frames:
-        warn(f"--frames {plan.frames}: only {frames} frames are left after {plan.start}; {frames} are imagined")
+        warn(f"--frames {plan.frames}: only {frames} frames are left after {plan.world.start}; {frames} are imagined")
 
 
 @contextlib.contextmanager

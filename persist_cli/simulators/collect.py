@@ -58,7 +58,7 @@ AGENT_DRAWS, LOOK_DRAWS, SENSOR_DRAWS = 1, 2, 3  # streams of random numbers bes
 _worker: dict[str, Any] = {}  # this worker process's plan, and its simulator once it is needed
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CollectPlan:
     """Options of ``persist collect`` as the user wrote them.
 

@@ -56,7 +56,7 @@ class ClipKeys:
     memory: str | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CacheKeys:
     """Makes the keys of all clips of a run.
 
@@ -92,7 +92,10 @@ class CacheKeys:
                 tokens |= {"kept": kept, "precision": recipe.training.precision}
             if noise := WritingNoise.of(recipe.data):
                 tokens |= {"noise": dataclasses.asdict(noise)}
-        return CacheKeys(latents, tokens, backbone.framewise, recipe.data.clips_per_trajectory > 0)
+        return CacheKeys(
+            latents=latents, tokens=tokens, whole_trajectories=backbone.framewise,
+            repeats=recipe.data.clips_per_trajectory > 0,
+        )  # fmt: skip
 
     def whole(self, frames: ClipFrames) -> bool:
         """Whether the entry of a clip has the latents of its whole trajectory; views of a clip have their own."""

@@ -99,7 +99,7 @@ DISTILLED_BASE: Final = (
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class FinetunePlan:
     """The options of ``persist finetune``; see its help."""
 

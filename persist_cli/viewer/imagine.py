@@ -17,15 +17,13 @@ from torch import Tensor
 
 from persist_cli.api.checkpoint import PLAIN, Checkpoint, find_checkpoint, reference_checkpoint
 from persist_cli.api.geometry import pose_differences
-from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.memory import Memory
 from persist_cli.api.memory_file import read_header
 from persist_cli.checkpoints.load import adapter_memory
 from persist_cli.data.clips import interactions_of
 from persist_cli.data.store import TrajectoryFile
 from persist_cli.errors import PersistError
-from persist_cli.rollout.camera_path import RolloutPlan
-from persist_cli.rollout.open_world import check_cells, check_memory, empty_memory, world_with
+from persist_cli.rollout.open_world import WorldOptions, check_cells, check_memory, empty_memory, world_with
 from persist_cli.rollout.world_model import WorldModel
 
 STEP: Final = 0.25  # metres from frame to frame on the way to the camera
@@ -145,15 +143,15 @@ class Imaginer:
         if self._world is None:
             checkpoint, info = self.find(), self.start.info
             adapter = self._adapter(checkpoint, memory)
-            plan = RolloutPlan(
-                self.start.path.name, (), True, 0, self.file, self.settings.adapter, False, self.settings.seed,
-                SamplingOverrides(), InferenceOptions(),
+            options = WorldOptions(
+                start=self.start.path.name, memory=self.file, adapter=self.settings.adapter, write=False,
+                seed=self.settings.seed, body=False,
             )  # fmt: skip
-            empty = empty_memory(checkpoint, adapter, plan, info)
+            empty = empty_memory(checkpoint, adapter, options, info)
             if memory is not None and empty is not None and self.file is not None:
                 check_memory(read_header(self.file), empty, checkpoint, self.file)
                 check_cells(memory, empty, self.file)
-            self._world = world_with(empty, checkpoint, adapter, plan, info)
+            self._world = world_with(empty, checkpoint, adapter, options, info)
             self._empty = self._world.agents[0].memory
         return self._world
 

@@ -18,7 +18,7 @@ from persist_cli.viewing.console import busy, print_json, say, warn
 from persist_cli.viewing.own_address import address_of, bind, is_loopback, leave, open_browser
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ViewPlan:
     """The options of ``persist view``; see its help.
 

@@ -16,10 +16,10 @@ NO_GPU = pytest.mark.skipif(torch.cuda.is_available(), reason="there is an accel
 def test_options_by_name_become_inference_options():
     assert InferenceOptions.of(None, None) == InferenceOptions()
     assert InferenceOptions.of("float16", "vae-tiling, model-offload") == InferenceOptions(
-        "float16", "model", tiling=True
+        dtype="float16", offload="model", tiling=True
     )
     assert InferenceOptions.of(None, "sequential-offload,vae-slicing") == InferenceOptions(
-        None, "sequential", slicing=True
+        dtype=None, offload="sequential", slicing=True
     )
 
 
@@ -52,7 +52,7 @@ def test_offloading_without_an_accelerator_is_refused(offload):
 
 def test_by_default_a_backbone_moves_to_the_device_and_saves_no_memory():
     backbone = micro()
-    Backbone.prepare_inference(backbone.train(), InferenceOptions("bfloat16"))
+    Backbone.prepare_inference(backbone.train(), InferenceOptions(dtype="bfloat16"))
     assert backbone.prompt.dtype == torch.bfloat16
     assert not backbone.training
     with pytest.raises(PersistError, match=r"^backbone 'cogvideox' cannot save memory; leave out --save-memory$"):

@@ -34,7 +34,7 @@ def test_slices_of_the_codec_change_no_colour_and_are_undone_by_other_options():
 def test_a_backbone_in_lower_precision_stays_so_and_samples_nearly_the_same():
     backbone, clips = trained(), random_clips(1, random_tokens(1, 5))
     rgb, _ = backbone.generate(clips, SAMPLING)
-    backbone.prepare_inference(InferenceOptions("bfloat16"))
+    backbone.prepare_inference(InferenceOptions(dtype="bfloat16"))
     assert {parameter.dtype for parameter in backbone.parameters()} == {torch.bfloat16}
     coarse, depth = backbone.generate(clips, SAMPLING)
     assert (coarse.dtype, depth.dtype) == (torch.uint8, torch.float32)

@@ -155,10 +155,12 @@ def measure(options: argparse.Namespace) -> tuple[list[dict[str, Any]], list[str
     checkpoints, loader = [find_checkpoint(path) for path in options.checkpoint], BackboneLoader()
     longest = loader.load(checkpoints[0]).frames_per_clip - 1
     samplings = [Sampling(int(steps), options.sampler, options.guidance) for steps in options.steps.split(",")]
-    rows = build_model_rows(checkpoints, RowConfig(options.adapters.split(","), (), samplings[0]), PROTOCOL)
+    rows = build_model_rows(
+        checkpoints, RowConfig(memories=options.adapters.split(","), controls=(), sampling=samplings[0]), PROTOCOL
+    )
     lengths = [int(frames) for frames in options.frames.split(",")]
     choices = [Choice(row, frames, sampling) for row in rows for frames in lengths for sampling in samplings]
-    cases = PROTOCOL.find(ClipSearch(options.data, 0, options.clips, longest))
+    cases = PROTOCOL.find(ClipSearch(folders=options.data, frames=0, limit=options.clips, predicted_at_once=longest))
     suite = MetricSuite(choose_metrics(FIGURES, METRICS), make_setup(cases))
     measured = [Measured() for _ in choices]
     for number in watched(range(len(cases)), "ways", "way"):

@@ -120,7 +120,10 @@ def main() -> None:
     parser.add_argument("--images", type=int, default=32)
     parser.add_argument("--houses", type=int, default=600, help="most training houses")
     given = parser.parse_args()
-    plan = SceneBenchPlan(None, str(given.data), given.train, ("completion",), images=given.images, houses=given.houses)
+    plan = SceneBenchPlan(
+        model=None, data=str(given.data), train=given.train, parts=("completion",), images=given.images,
+        houses=given.houses,
+    )  # fmt: skip
     views = read_views(chosen_files(plan), plan)
     houses = training_houses(plan, views)
     columns = ["unseen cells", "mIoU", "structure", *STRUCTURE]

@@ -116,11 +116,14 @@ def enlarge(memory: Memory, cells: int) -> None:
 
 def opened(arguments: argparse.Namespace) -> Play:
     """Open the walk of the options."""
-    settings = PlaySettings(arguments.steps, arguments.guidance, ahead=False, clip_frames=arguments.clip_frames)
+    settings = PlaySettings(
+        steps=arguments.steps, guidance=arguments.guidance, ahead=False, clip_frames=arguments.clip_frames
+    )
     memories = tuple(arguments.memories.split(","))
     options = open_play.PlayOptions(
-        arguments.checkpoint, StartOptions(arguments.start), memories, tuple(arguments.memory), settings
-    )
+        checkpoint=arguments.checkpoint, begin=StartOptions(arguments.start), memories=memories,
+        given=tuple(arguments.memory), settings=settings,
+    )  # fmt: skip
     play = open_play.open_play(options)
     if arguments.cells:
         for memory in play._walkers._start:

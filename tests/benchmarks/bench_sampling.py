@@ -148,9 +148,13 @@ def make_comparison(options: argparse.Namespace) -> Comparison:
     samplers = options.samplers.split(",") if options.samplers else backbone.samplers
     counts = [int(steps) for steps in options.steps.split(",")]
     samplings = [Sampling(steps, sampler, options.guidance) for sampler in samplers for steps in counts]
-    cases = PROTOCOL.find(ClipSearch(options.data, 0, options.clips, backbone.frames_per_clip - 1))
+    cases = PROTOCOL.find(
+        ClipSearch(folders=options.data, frames=0, limit=options.clips, predicted_at_once=backbone.frames_per_clip - 1)
+    )
     adapters = sorted({name for checkpoint in checkpoints for name in checkpoint.adapters})
-    models = build_model_rows(checkpoints, RowConfig([PLAIN, *adapters], (), samplings[0]), PROTOCOL)
+    models = build_model_rows(
+        checkpoints, RowConfig(memories=[PLAIN, *adapters], controls=(), sampling=samplings[0]), PROTOCOL
+    )
     adapter = options.adapter or next((name for name in ("voxel", *adapters) if name in adapters), None)
     row = next((row for row in models if row.adapter == adapter), None)
     if row is None:

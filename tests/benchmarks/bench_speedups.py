@@ -170,7 +170,7 @@ def main() -> None:
     say_conditions(f"the reference model with untrained weights, 64×64, batches of {BATCH}")
     with TemporaryDirectory() as folder:
         data = write_room_walks(Path(folder), 64, frames=100)
-        dataset = ClipDataset([data], ClipPlan(9, (1,), 96, 0, (64, 64)))
+        dataset = ClipDataset([data], ClipPlan(frames=9, strides=(1,), context_frames=96, seed=0, image_size=(64, 64)))
         samples = [dataset[number] for number in range(BATCH)]
         clips = [sample.clip for sample in samples]
         longest = max(samples, key=lambda sample: len(sample.context or ()))

@@ -108,7 +108,8 @@ class Walk:
 
 def walk(policy: NomadPolicy, simulator: Simulator, episode: Episode) -> Walk:
     """Let the policy act until it has no actions left."""
-    scene, parts, planning = TrueScene(simulator, episode), RowParts(policy=policy), PlanSettings(policy.longest or 8)
+    scene, parts = TrueScene(simulator, episode), RowParts(policy=policy)
+    planning = PlanSettings(horizon=policy.longest or 8)
     trace = Trace([scene.distance], [scene.simulator.agent[0]])
     recorder = Recorder(policy, scene.info)
     with torch.no_grad():

@@ -51,7 +51,9 @@ def readers(folder: Path, size: int) -> dict[str, Callable[[], Any]]:
     images = [images_of(file.read(span).observations) for file, span in spans]
 
     def dataset(strides: tuple[int, ...], context: int) -> ClipDataset:
-        return ClipDataset([folder], ClipPlan(FRAMES, strides, context, 0, (size, size)))
+        return ClipDataset(
+            [folder], ClipPlan(frames=FRAMES, strides=strides, context_frames=context, seed=0, image_size=(size, size))
+        )
 
     plain, strided, remembered = dataset((1,), 0), dataset((1, 2, 3), 0), dataset((1,), 48)
     return {

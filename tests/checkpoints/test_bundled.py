@@ -27,8 +27,9 @@ def home(tmp_path_factory, held_out):
     folder = tmp_path_factory.mktemp("home")
     runs = write_runs(folder / "runs")
     plan = ExportPlan(
-        runs / "stage1", [str(runs / "none"), str(runs / "voxel")], "float16", "voxel", SamplingOverrides(steps=1)
-    )
+        checkpoint=runs / "stage1", runs=[str(runs / "none"), str(runs / "voxel")], dtype="float16", default="voxel",
+        sampling=SamplingOverrides(steps=1),
+    )  # fmt: skip
     run_export(plan, folder / "reference", False)
     shutil.copytree(held_out, folder / "sample")
     return folder

@@ -33,7 +33,7 @@ KINDS = [field.name for field in fields(SampleShares) if field.name not in ("nam
 def houses(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two houses in which an agent interacts."""
     folder, world = tmp_path_factory.mktemp("houses"), make_world(height=32, width=32)
-    plan = CollectPlan("miniworld", "0:10", frames=48, size="32x32", policy="interact")
+    plan = CollectPlan(simulator="miniworld", scenes="0:10", frames=48, size="32x32", policy="interact")
     for seed in (9001, 9002):
         frames = collect_frames(world, plan, seed)
         write_trajectory(folder / f"house-{seed}.parquet", world.info, frames)

@@ -33,7 +33,7 @@ SAVING = ["training.batch=2", "training.vae_slicing=true", "training.gradient_ch
 
 SEARCHED = ["training.batch=2", "training.precision=no", "training.ema_device=cpu"]
 
-ONE_GPU = Launch(1, True)
+ONE_GPU = Launch(devices=1, cuda=True)
 
 
 def micro_meta_model(*settings: str, recipe: str = "tiny-stage1"):
@@ -130,13 +130,15 @@ def test_a_discriminator_is_counted_with_all_that_its_training_takes():
 
 
 def test_fsdp_divides_what_is_trained_by_the_number_of_processes():
-    whole, shared = without_step(), without_step(launch=Launch(8, True, sharded=True))
+    whole, shared = without_step(), without_step(launch=Launch(devices=8, cuda=True, sharded=True))
     for name in ("optimizer", "gradients", "average"):
         assert shared.to_json()[name] == pytest.approx(whole.to_json()[name] / 8, abs=8)
 
 
 def test_offloading_moves_all_but_what_is_never_sharded_into_the_memory_of_the_cpu():
-    shared, offloaded = (estimate(launch=Launch(2, True, True, offloaded)) for offloaded in (False, True))
+    shared, offloaded = (
+        estimate(launch=Launch(devices=2, cuda=True, sharded=True, offloaded=offloaded)) for offloaded in (False, True)
+    )
     assert (offloaded.gradients, offloaded.optimizer, offloaded.average, offloaded.update) == (0, 0, 0, 0)
     assert offloaded.activations == shared.activations
     codec = sum(parameter.nbytes for parameter in estimator().backbone.get_submodule("codec").parameters())
@@ -149,8 +151,8 @@ def test_offloading_moves_all_but_what_is_never_sharded_into_the_memory_of_the_c
 def test_an_average_on_the_cpu_is_whole_for_each_process_and_divided_with_fsdp():
     average = "training.ema_device=cpu"
     trained = sum(parameter.nbytes for parameter in estimator().backbone.trained_parameters("1").values())
-    assert without_step(average, launch=Launch(2, True)).host == 2 * trained
-    assert without_step(average, launch=Launch(2, True, sharded=True)).host == trained
+    assert without_step(average, launch=Launch(devices=2, cuda=True)).host == 2 * trained
+    assert without_step(average, launch=Launch(devices=2, cuda=True, sharded=True)).host == trained
 
 
 @pytest.mark.parametrize(
@@ -279,7 +281,7 @@ def test_every_form_of_memory_can_be_estimated():
         changes = ["base=nowhere", f"adapter={{form: {form}, width: 16, token_budget: 64}}"]
         meta_model = micro_meta_model(*changes, recipe="tiny-stage2-voxel")
         copies = ShallowCopies(meta_model.backbone, meta_model.channels)
-        peaks[form] = copies.activations(meta_model.recipe, StepKind(1, True), encoded()).peak
+        peaks[form] = copies.activations(meta_model.recipe, StepKind(batch=1, cuda=True), encoded()).peak
     assert peaks["projected"] > peaks["cross"] > 0  # tokens for each latent frame
     assert peaks["canvas"] > 0
     assert peaks["rendered"] > 0
@@ -291,7 +293,7 @@ def test_estimating_leaves_nothing_behind_in_the_caches_of_the_model():
     settings = f"backbone.settings.transformer={{{', '.join(rotary)}, num_attention_heads: 1, attention_head_dim: 32}}"
     meta_model = micro_meta_model(settings)
     _fitted_positions.cache_clear()
-    ShallowCopies(meta_model.backbone, None).activations(meta_model.recipe, StepKind(1, True), encoded())
+    ShallowCopies(meta_model.backbone, None).activations(meta_model.recipe, StepKind(batch=1, cuda=True), encoded())
     region = ((0, 0), (2, 2))
     assert type(_fitted_positions(32, (1, 2, 2), region, "cpu")[0]) is torch.Tensor
     assert _fitted_positions.cache_info().currsize == 1

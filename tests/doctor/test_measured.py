@@ -52,7 +52,7 @@ def walks_of(tmp_path_factory: pytest.TempPathFactory):
 def estimate(run: Run, cuda: bool = False) -> int:
     recipe, _, settings = run
     meta_model = build_meta_model(recipe, [*SHORT, *settings])
-    return meta_model.estimator().estimate(meta_model.recipe, Launch(1, cuda)).peak
+    return meta_model.estimator().estimate(meta_model.recipe, Launch(devices=1, cuda=cuda)).peak
 
 
 def trained_stage1(data: str, settings: list[str]) -> Path:

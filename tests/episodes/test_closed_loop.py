@@ -25,9 +25,12 @@ from persist_cli.plugins import make_policy
 from persist_cli.simulators.miniworld import MiniWorld
 from tests.support.pixel_cost import PixelCost
 
-RANKED = PlanningRow("rank-2, simulator", "rank", "random", "simulator", "image", walk=False, candidates=2)
-STRAIGHT = PlanningRow("straight", "policy", "straight", None, "place", walk=False)
-ALONE = PlanningRow("policy", "policy", "random", None, "image", walk=False)
+RANKED = PlanningRow(
+    name="rank-2, simulator", planner="rank", policy="random", memory="simulator", goal="image", walk=False,
+    candidates=2,
+)  # fmt: skip
+STRAIGHT = PlanningRow(name="straight", planner="policy", policy="straight", memory=None, goal="place", walk=False)
+ALONE = PlanningRow(name="policy", planner="policy", policy="random", memory=None, goal="image", walk=False)
 COST = PixelCost(None)
 
 
@@ -110,7 +113,9 @@ def test_an_agent_that_hit_something_knows_it(episodes: EpisodeSet, small_world:
 
 
 def test_a_row_of_cem_plans_with_what_was_set_and_keeps_nothing_where_that_is_said() -> None:
-    row = PlanningRow("cem, simulator", "cem", None, "simulator", "place", walk=True, candidates=7)
+    row = PlanningRow(
+        name="cem, simulator", planner="cem", policy=None, memory="simulator", goal="place", walk=True, candidates=7
+    )
     plans = PlanSettings().of_cem(["method.kept=0.3", "method.smoothing=0"], rounds=2)
     wanted = CemSettings(horizon=5, candidates=7, rounds=2, kept=0.3, smoothing=0.0, shift=0.5)
     assert make_planner(row, None, plans, 5).settings == wanted

@@ -16,13 +16,16 @@ from persist_cli.evaluate.plan import EvalPlan, Evaluation
 from persist_cli.evaluate.protocols import PROTOCOLS, ClipSearch
 from persist_cli.metrics import METRICS
 
-PLAN = EvalPlan((), "revisit", None, (), (), 0, 8, 1, SamplingOverrides(), 4, (5.0, 2.0), InferenceOptions())
+PLAN = EvalPlan(
+    data=(), protocol="revisit", memories=None, controls=(), metrics=(), frames=0, clips=8, seeds=1,
+    sampling=SamplingOverrides(), batch=4, noise=(5.0, 2.0), placement=InferenceOptions(),
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def cases(held_out):
     """Six clips of 17 frames of two scenes, as if the first scene were in two data sets."""
-    one, two = PROTOCOLS["revisit"].find(ClipSearch([held_out], 0, 8, 8))
+    one, two = PROTOCOLS["revisit"].find(ClipSearch(folders=[held_out], frames=0, limit=8, predicted_at_once=8))
     several = [replace(one, data=f"{one.data}/"), two, one, one, two, one]
     whole = {"frames": 17, "seen_before": (1.0,) * 17, "first_visits": (-1,) * 17, "counted": (True,) * 17}
     return [replace(case, **whole) for case in several]
@@ -32,7 +35,10 @@ def table_of(cases, clips, resample="scenes"):
     """A table over some clips of an evaluation by PSNR and FVD."""
     suite = MetricSuite(choose_metrics(("psnr", "fvd"), METRICS), make_setup(cases))
     plan, journal = replace(PLAN, resample=resample), Journal(Path("unused"))
-    run = Evaluation(plan, Sampling(), [], PROTOCOLS["revisit"], cases, [], [], [suite], journal)
+    run = Evaluation(
+        plan=plan, sampling=Sampling(), checkpoints=[], protocol=PROTOCOLS["revisit"], cases=cases, rows=[], missing=[],
+        suites=[suite], journal=journal,
+    )  # fmt: skip
     return Table(run, "all", clips)
 
 

@@ -36,7 +36,10 @@ def backbone(stage1):
 
 @pytest.fixture(scope="module")
 def revisits(held_out):
-    return [read_case(case) for case in PROTOCOLS["revisit"].find(ClipSearch([held_out], 0, 8, 8))]
+    return [
+        read_case(case)
+        for case in PROTOCOLS["revisit"].find(ClipSearch(folders=[held_out], frames=0, limit=8, predicted_at_once=8))
+    ]
 
 
 def test_a_view_warped_into_itself_is_itself():
@@ -76,7 +79,7 @@ def test_copy_repeats_the_given_frame(backbone, revisits):
 
 
 def test_the_nearest_frame_at_a_pose_seen_before_is_the_true_one(backbone, walks):
-    every_frame = ClipSearch([walks], 0, 8, 8, new_poses=NewPoses(0, 0))
+    every_frame = ClipSearch(folders=[walks], frames=0, limit=8, predicted_at_once=8, new_poses=NewPoses(0, 0))
     clip = read_case(PROTOCOLS["revisit"].find(every_frame)[0])
     for row in (Nearest("nearest", None, writes=False), Warp("warp", None, writes=False)):
         rgb, _ = row.videos(backbone, [clip], [0])
@@ -84,7 +87,7 @@ def test_the_nearest_frame_at_a_pose_seen_before_is_the_true_one(backbone, walks
 
 
 def test_the_nearest_frame_is_taken_from_what_the_memory_holds_by_then(backbone, held_out):
-    case = PROTOCOLS["return"].find(ClipSearch([held_out], 0, 1, 8))[0]
+    case = PROTOCOLS["return"].find(ClipSearch(folders=[held_out], frames=0, limit=1, predicted_at_once=8))[0]
     clip = read_case(case)
     row = Nearest("nearest", None, writes=True)
     assert row.held(clip, 8, 8).nonzero()[:, 0].tolist() == [0]
@@ -94,7 +97,9 @@ def test_the_nearest_frame_is_taken_from_what_the_memory_holds_by_then(backbone,
 
 
 def test_the_codec_gives_as_many_frames_as_the_clip_has(backbone, held_out):
-    clip = read_case(PROTOCOLS["return"].find(ClipSearch([held_out], 0, 1, 8))[0])
+    clip = read_case(
+        PROTOCOLS["return"].find(ClipSearch(folders=[held_out], frames=0, limit=1, predicted_at_once=8))[0]
+    )
     rgb, depth = CodecReconstruction("codec", None).videos(backbone, [clip], [0])
     assert rgb.shape[1] == depth.shape[1] == len(clip.observations) == 24
     assert torch.equal(rgb[0, 0], clip.observations.rgb[0])

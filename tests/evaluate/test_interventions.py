@@ -28,7 +28,7 @@ from tests.support.cell_walks import cells_around, write_with_cells
 
 @pytest.fixture(scope="module")
 def cases(held_out):
-    return PROTOCOLS["revisit"].find(ClipSearch([held_out], 0, 8, 8))
+    return PROTOCOLS["revisit"].find(ClipSearch(folders=[held_out], frames=0, limit=8, predicted_at_once=8))
 
 
 def test_a_shuffled_memory_holds_another_scene_moved_to_where_the_clip_begins(cases):
@@ -60,7 +60,7 @@ def test_the_oracle_holds_the_frames_of_the_clip_and_the_emptied_memory_none(cas
 
 def test_a_scene_of_true_cells_begins_with_those_of_the_clips_first_frame_and_no_frames(held_out, tmp_path):
     folder = write_with_cells(held_out, tmp_path / "cells")
-    case = PROTOCOLS["revisit"].find(ClipSearch([folder], 0, 8, 8))[0]
+    case = PROTOCOLS["revisit"].find(ClipSearch(folders=[folder], frames=0, limit=8, predicted_at_once=8))[0]
     clip = read_case(case)
     assert TrueCells().context(clip) is None
     assert torch.equal(TrueCells().cells(clip).classes, cells_around(case.file, case.start).classes)

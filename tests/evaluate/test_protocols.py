@@ -24,7 +24,10 @@ EVERY_POSE = NewPoses(0.0, 0.0)
 
 def search(folder, frames=0, scenes=(), new_poses=NEW_POSES):
     """A search for at most eight clips, for a model that predicts eight frames at once."""
-    return ClipSearch([folder], frames, 8, 8, frozenset(scenes), new_poses)
+    return ClipSearch(
+        folders=[folder], frames=frames, limit=8, predicted_at_once=8, training_scenes=frozenset(scenes),
+        new_poses=new_poses,
+    )  # fmt: skip
 
 
 def world_from_camera(case):

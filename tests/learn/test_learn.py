@@ -296,7 +296,7 @@ def test_walks_are_imagined_in_the_precision_that_is_asked_for(walks, voxel, pol
     plan = LearnPlan(
         views=(f"{walks}#0:0-12",), policy=str(policy_run), inside="model", checkpoint=voxel, adapter=None, rounds=1,
         practice=PracticeSettings(), steps=1, training=(), episodes=None, loop=LoopSettings(), sampling=ONE, seed=0,
-        placement=InferenceOptions("bfloat16"),
+        placement=InferenceOptions(dtype="bfloat16"),
     )  # fmt: skip
     place = open_place(prepare(plan, tmp_path / "out"))
     assert isinstance(place, ImaginedPlace)

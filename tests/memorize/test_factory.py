@@ -35,8 +35,10 @@ def test_memories_of_one_costly_encoder_share_its_weights_and_features():
 
 
 def test_a_clip_has_tokens_only_when_its_memory_has_a_context(walks):
-    clips = ClipDataset([walks], ClipPlan(9, (1,), 0, 3, (SIZE, SIZE)))
-    with_context = ClipDataset([walks], ClipPlan(9, (1,), 12, 3, (SIZE, SIZE)))
+    clips = ClipDataset([walks], ClipPlan(frames=9, strides=(1,), context_frames=0, seed=3, image_size=(SIZE, SIZE)))
+    with_context = ClipDataset(
+        [walks], ClipPlan(frames=9, strides=(1,), context_frames=12, seed=3, image_size=(SIZE, SIZE))
+    )
     factory = MemoryFactory.of(MemoryConfig("voxel"), torch.device("cpu"))
     nothing, something = (with_memory(sample, factory, 64).tokens for sample in (clips[5], with_context[5]))
     assert len(nothing) == 0 < len(something) <= 64
@@ -44,7 +46,9 @@ def test_a_clip_has_tokens_only_when_its_memory_has_a_context(walks):
 
 def test_a_memory_that_is_no_scene_refuses_true_cells_in_one_line(walks, tmp_path):
     folder = write_with_cells(walks, tmp_path / "cells")
-    clips = ClipDataset([folder], ClipPlan(9, (1,), 12, 3, (SIZE, SIZE), true_cells=1.0))
+    clips = ClipDataset(
+        [folder], ClipPlan(frames=9, strides=(1,), context_frames=12, seed=3, image_size=(SIZE, SIZE), true_cells=1.0)
+    )
     with pytest.raises(RecipeError, match="memory 'voxel' takes no true cells; use the memory scene"):
         with_memory(clips[0], MemoryFactory.of(MemoryConfig("voxel")), 64)
 

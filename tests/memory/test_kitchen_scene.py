@@ -50,7 +50,7 @@ def kitchen(tmp_path_factory) -> Kitchen:
     if not KITCHEN.is_dir():
         pytest.skip("the Kinect frames of ../shared/data/kitchen are not here")
     folder = tmp_path_factory.mktemp("kitchen")
-    run_import("7scenes", KITCHEN, folder / "data", ImportPlan((96, 128), 5), False)
+    run_import("7scenes", KITCHEN, folder / "data", ImportPlan(size=(96, 128), every=5), False)
     ends = zip((0, *(number + 1 for number in HELD_OUT)), (*HELD_OUT, 24), strict=True)
     frames = [f"{folder}/data#0:{first}-{end}" for first, end in ends]
     with pytest.raises(SystemExit) as ended:

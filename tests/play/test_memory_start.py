@@ -30,8 +30,8 @@ def remembered(walks, tmp_path_factory):
 
 
 def test_a_walk_begins_where_the_last_path_of_a_memory_ends(voxel, walks, remembered):
-    play = open_play(PlayOptions(voxel, StartOptions(str(remembered))))
-    there = open_play(PlayOptions(voxel, StartOptions(f"{walks}#0:11")))
+    play = open_play(PlayOptions(checkpoint=voxel, begin=StartOptions(str(remembered))))
+    there = open_play(PlayOptions(checkpoint=voxel, begin=StartOptions(f"{walks}#0:11")))
     one, two = play.shown.pose, there.shown.pose
     assert (one.x, one.y, one.degrees) == pytest.approx((two.x, two.y, two.degrees))
     assert play.shown.images["voxel"].shape == (SIZE, SIZE, 3)
@@ -43,7 +43,8 @@ def test_a_walk_begins_where_the_last_path_of_a_memory_ends(voxel, walks, rememb
 def test_a_memory_file_needs_no_suffix(voxel, remembered, tmp_path):
     file = tmp_path / "room"
     file.write_bytes(remembered.read_bytes())
-    assert open_play(PlayOptions(voxel, StartOptions(str(file)))).shown.images["voxel"].shape == (SIZE, SIZE, 3)
+    play = open_play(PlayOptions(checkpoint=voxel, begin=StartOptions(str(file))))
+    assert play.shown.images["voxel"].shape == (SIZE, SIZE, 3)
 
 
 def test_a_completed_scene_is_entered_on_open_ground(tmp_path):
@@ -74,10 +75,10 @@ def test_a_start_in_a_memory_that_does_not_fit_is_refused(voxel, tmp_path):
     empty = empty_scene()
     empty.save(tmp_path / "empty.safetensors", {})
     with pytest.raises(DataError, match="holds no places to stand at"):
-        open_play(PlayOptions(voxel, StartOptions(str(tmp_path / "empty.safetensors"))))
+        open_play(PlayOptions(checkpoint=voxel, begin=StartOptions(str(tmp_path / "empty.safetensors"))))
     empty.add(cell_room())
     empty.save(tmp_path / "scene.safetensors", {})
     with pytest.raises(CheckpointError, match="a memory of kind 'scene', which voxel cannot read"):
-        open_play(PlayOptions(voxel, StartOptions(str(tmp_path / "scene.safetensors"))))
+        open_play(PlayOptions(checkpoint=voxel, begin=StartOptions(str(tmp_path / "scene.safetensors"))))
     with pytest.raises(CheckpointError, match="no such memory file"):
-        open_play(PlayOptions(voxel, StartOptions(str(tmp_path / "none.safetensors"))))
+        open_play(PlayOptions(checkpoint=voxel, begin=StartOptions(str(tmp_path / "none.safetensors"))))

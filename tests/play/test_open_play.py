@@ -21,7 +21,7 @@ FORWARD = frozenset({"forward"})
 
 def opened(checkpoint, start, *, picture=None, **options):
     begin = StartOptions(str(start), picture or PictureOptions())
-    return open_play(PlayOptions(checkpoint, begin, settings=FAST, **options))
+    return open_play(PlayOptions(checkpoint=checkpoint, begin=begin, settings=FAST, **options))
 
 
 def test_a_walk_begins_at_a_frame_of_data_in_each_memory(voxel, walks):
@@ -109,7 +109,9 @@ def test_memories_that_do_not_fit_are_refused(persist, voxel, walks, tmp_path):
 
 def test_walks_that_share_a_model_do_not_share_what_they_remember(voxel, walks):
     begin = StartOptions(f"{walks}#0:2")
-    walk = open_walks(PlayOptions(voxel, begin, settings=FAST, memories=("voxel",), given=(f"{walks}#0:0-3",)))
+    walk = open_walks(
+        PlayOptions(checkpoint=voxel, begin=begin, settings=FAST, memories=("voxel",), given=(f"{walks}#0:0-3",))
+    )
     one, two = walk(), walk()
     alone = [one.advance(FORWARD) for _ in range(10)]
     beside = [two.advance(FORWARD) for _ in range(10)]

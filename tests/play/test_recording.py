@@ -20,7 +20,10 @@ from tests.support.micro_runs import BACK, OUT, SIZE
 @pytest.fixture(scope="module")
 def recorded(voxel, walks, tmp_path_factory):
     """A walk of five frames with a jump home in it, its last frame, and its files."""
-    options = PlayOptions(voxel, StartOptions(f"{walks}#0:2"), ("voxel", "stage1"), settings=PlaySettings())
+    options = PlayOptions(
+        checkpoint=voxel, begin=StartOptions(f"{walks}#0:2"), memories=("voxel", "stage1"),
+        settings=PlaySettings(),
+    )  # fmt: skip
     play = open_play(options)
     play.record()
     for held in ("left", "left", "forward"):
@@ -53,7 +56,7 @@ def test_a_recording_is_followed_by_rollout(persist, voxel, recorded, tmp_path):
 
 
 def test_a_recording_is_measured_by_eval(persist, voxel, held_out, tmp_path):
-    play = open_play(PlayOptions(voxel, StartOptions(f"{held_out}#0:0")))
+    play = open_play(PlayOptions(checkpoint=voxel, begin=StartOptions(f"{held_out}#0:0")))
     play.record()
     for name in (*OUT, *BACK):
         play.advance({name})
@@ -66,7 +69,7 @@ def test_a_recording_is_measured_by_eval(persist, voxel, held_out, tmp_path):
 
 def test_a_full_recording_keeps_its_frames_whatever_is_undone_and_walked_then(voxel, walks, tmp_path, monkeypatch):
     monkeypatch.setattr(recording, "LONGEST", 3)
-    play = open_play(PlayOptions(voxel, StartOptions(f"{walks}#0:2")))
+    play = open_play(PlayOptions(checkpoint=voxel, begin=StartOptions(f"{walks}#0:2")))
     play.record()
     seen = [play.advance({"left"}) for _ in range(3)]
     play.undo()
@@ -79,14 +82,14 @@ def test_a_full_recording_keeps_its_frames_whatever_is_undone_and_walked_then(vo
 
 
 def test_a_recording_does_not_keep_the_clips_of_its_frames(voxel, walks):
-    play = open_play(PlayOptions(voxel, StartOptions(f"{walks}#0:2")))
+    play = open_play(PlayOptions(checkpoint=voxel, begin=StartOptions(f"{walks}#0:2")))
     play.record()
     play.advance({"left"})
     assert all(frame.rgb.base is None and frame.depth.base is None for [frame] in play._recording._frames)
 
 
 def test_nothing_is_saved_of_a_walk_without_a_step(voxel, walks, tmp_path):
-    play = open_play(PlayOptions(voxel, StartOptions(f"{walks}#0:2")))
+    play = open_play(PlayOptions(checkpoint=voxel, begin=StartOptions(f"{walks}#0:2")))
     with pytest.raises(PersistError, match="nothing was recorded"):
         play.save_recording(tmp_path)
     play.record()

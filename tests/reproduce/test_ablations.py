@@ -37,7 +37,10 @@ from tests.support.example_results import example_results
 
 OUT = Path("my runs/ablations")
 
-PLAN = Plan(OUT, (1000, 5000), ablation_names(), "reference", default_data(OUT), default_held_out(OUT))
+PLAN = Plan(
+    out=OUT, samples=(1000, 5000), recipes=ablation_names(), base="reference", data=default_data(OUT),
+    held_out=default_held_out(OUT),
+)  # fmt: skip
 
 LINES = [
     *preparations(PLAN, 40),

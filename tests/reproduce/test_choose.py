@@ -45,7 +45,10 @@ HOUSES = (Path("runs/houses"),)
 
 def plan(out: Path, *memories: str) -> Plan:
     """The plan of some memories with validation houses of its own."""
-    return Plan(out, str(out / "base"), HOUSES, default_validation(out), memories or tuple(TRIALS))
+    return Plan(
+        out=out, base=str(out / "base"), data=HOUSES, validation=default_validation(out),
+        memories=memories or tuple(TRIALS),
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("memory", TRIALS)

@@ -37,7 +37,10 @@ MEMORIES = ("voxel", "none", "simulator")
 
 @pytest.fixture
 def plan(voxel: Path, policy_run: Path, tmp_path: Path) -> Plan:
-    return Plan(tmp_path / "my runs", str(voxel), str(policy_run), MEMORIES, 6, 0, 32, 1, "--walks 4")
+    return Plan(
+        out=tmp_path / "my runs", model=str(voxel), policy=str(policy_run), memories=MEMORIES, houses=6, first=0,
+        views=32, rounds=1, options="--walks 4",
+    )  # fmt: skip
 
 
 def learned(before: float, after: float) -> dict[str, Any]:

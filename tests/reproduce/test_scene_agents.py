@@ -48,7 +48,10 @@ def packaged(monkeypatch: pytest.MonkeyPatch, collecting_here: None) -> None:
 
 @pytest.fixture
 def plan(house_model: Path, tmp_path: Path) -> Plan:
-    return Plan(tmp_path / "my runs", "reference", str(house_model), MEMORIES, 6, 400, 2, 4096, 8, 100, 1)
+    return Plan(
+        out=tmp_path / "my runs", model="reference", scene_model=str(house_model), memories=MEMORIES, houses=6,
+        first=400, seeds=2, steps=4096, envs=8, episodes=100, denoising_steps=1,
+    )  # fmt: skip
 
 
 def keep(plan: Plan, house: int, memory: str, before: float, after: float) -> None:
@@ -126,7 +129,10 @@ def test_few_houses_have_no_intervals_and_nothing_is_compared_with_itself() -> N
 def test_in_a_scene_that_shuts_the_agent_in_nothing_is_learned_and_the_reason_is_kept(tmp_path: Path) -> None:
     make_world()
     model = house_scene_model(tmp_path / "walls", "wall")
-    plan = Plan(tmp_path / "out", "reference", str(model), ("scene",), 1, 105, 1, 4, 1, 1, 1)
+    plan = Plan(
+        out=tmp_path / "out", model="reference", scene_model=str(model), memories=("scene",), houses=1, first=105,
+        seeds=1, steps=4, envs=1, episodes=1, denoising_steps=1,
+    )  # fmt: skip
     learning = Learning(plan, 105, "scene", 0)
     learning.memory_file.parent.mkdir(parents=True)
     run_persist(*shlex.split(memorize_line(learning, "sample#0:0")))

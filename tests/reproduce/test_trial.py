@@ -9,7 +9,7 @@ from types import ModuleType
 import pytest
 
 from persist_cli.cli.app import commands
-from persist_cli.cli.planning import refuse_other_parts
+from persist_cli.cli.bench import refuse_other_parts
 from persist_cli.recipe import apply_overrides, make_recipe, read_recipe
 from persist_cli.reproduce import scenes, table1
 from persist_cli.reproduce.trial import small, trial_folder

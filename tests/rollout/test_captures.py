@@ -67,7 +67,7 @@ def test_following_takes_no_size_of_actions(roll, capture):
 def test_the_real_kitchen_is_walked_by_the_actions_of_its_import(roll, tmp_path):
     if not KITCHEN.is_dir():
         pytest.skip("the Kinect frames of ../shared/data/kitchen are not here")
-    run_import("7scenes", KITCHEN, tmp_path / "k", ImportPlan((SIZE, SIZE), 10, 0.1, 5.0), False)
+    run_import("7scenes", KITCHEN, tmp_path / "k", ImportPlan(size=(SIZE, SIZE), every=10, step=0.1, turn=5.0), False)
     result, poses = roll(tmp_path / "k", "--actions", "left*3 forward*2")
     assert result.code == 0, result.err
     up = torch.tensor(Store(tmp_path / "k")[0].info.world_up)

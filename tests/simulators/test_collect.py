@@ -22,8 +22,8 @@ from persist_cli.errors import DataError, PersistError
 from persist_cli.simulators.collect import FIRST_SEED, SPLIT_SCENES, CollectPlan, claim_folder, run_collect
 from tests.support.miniworlds import make_world
 
-SMALL = CollectPlan("miniworld", "0:3", frames=6, size="16x24")
-FIVE = CollectPlan("miniworld", "0:5", frames=12, size="32x32")
+SMALL = CollectPlan(simulator="miniworld", scenes="0:3", frames=6, size="16x24")
+FIVE = CollectPlan(simulator="miniworld", scenes="0:5", frames=12, size="32x32")
 COMMAND = "collect miniworld --scenes 0:5 --frames 12 --size 32x32 --workers"
 
 

@@ -39,7 +39,7 @@ def dark(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def collect(world: MiniWorld, policy: str, scene: int, frames: int = 60, seed: int = 0) -> list[Frame]:
-    plan = CollectPlan("miniworld", "0:10", frames=frames, seed=seed, policy=policy)
+    plan = CollectPlan(simulator="miniworld", scenes="0:10", frames=frames, seed=seed, policy=policy)
     return list(collect_frames(world, plan, scene))
 
 

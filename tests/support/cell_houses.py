@@ -59,7 +59,10 @@ def view_of(grid: CellGrid, known: Bool[Tensor, "first second level"], radius: f
     frame = Observations(torch.zeros(*size, 3, dtype=torch.uint8), torch.zeros(*size), cameras)
     truth = true_region(grid, region)
     near = near_camera(truth, pose[:3, 3], radius)
-    return View("house:0", "house", room.info, frame, region, region.of(seen), truth, near, grid)
+    return View(
+        name="house:0", scene="house", info=room.info, frame=frame, region=region, known=region.of(seen), truth=truth,
+        near=near, house=grid,
+    )  # fmt: skip
 
 
 def known_room(grid: CellGrid) -> Bool[Tensor, "first second level"]:

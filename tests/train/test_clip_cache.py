@@ -90,12 +90,12 @@ def test_views_that_come_only_once_are_not_cached(persist, walks, tmp_path):
 
 def test_a_long_trajectory_is_encoded_in_pieces_to_the_same_latents(walks, tmp_path, monkeypatch):
     backbone = make_backbone("cogvideox", MICRO | {"vae": MICRO["vae"] | {"temporal_compression_ratio": 1}})
-    clips = ClipDataset([walks], ClipPlan(9, (1,), 0, 3, (SIZE, SIZE)))
+    clips = ClipDataset([walks], ClipPlan(frames=9, strides=(1,), context_frames=0, seed=3, image_size=(SIZE, SIZE)))
     latents = []
     for pixels in (1 << 22, 7 * SIZE * SIZE):
         monkeypatch.setattr(sources, "PIXELS_AT_ONCE", pixels)
         tensors = TensorCache(CacheSettings(tmp_path / str(pixels), 1))
-        cache = ClipCache(tensors, CacheKeys({}, None, backbone.framewise))
+        cache = ClipCache(tensors, CacheKeys(latents={}, tokens=None, whole_trajectories=backbone.framewise))
         ClipEncoder(backbone, None, Accelerator(cpu=True), cache).with_latents(CachedClips(clips, cache)[0])
         latents.append(read_tensors(entries(tmp_path / str(pixels))[0])[0]["video"])
     assert len(latents[0]) == 24
@@ -163,7 +163,9 @@ def keys_of(walks, voxel):
     """Makes the keys of one clip for a stage, a number of tokens, a changed codec, and changes to the memory."""
     checkpoint = find_checkpoint(voxel)
     backbone, usual = load_backbone(checkpoint), adapter_memory(checkpoint, "voxel")
-    frames = ClipDataset([walks], ClipPlan(9, (1,), 5, 3, (SIZE, SIZE))).choose(0)
+    frames = ClipDataset(
+        [walks], ClipPlan(frames=9, strides=(1,), context_frames=5, seed=3, image_size=(SIZE, SIZE))
+    ).choose(0)
 
     def of(stage="2", budget=7, codec=0.0, precision="no", **changes):
         memory = replace(usual, **changes) if stage == "2" else None
@@ -225,7 +227,7 @@ def clips_in(walks: Path, folder: Path, **changes: object) -> CachedClips:
     """Clips that look into a cache, whose keys depend on made-up values."""
     plan = {"frames": 9, "strides": (1, 2), "context_frames": 5, "seed": 3, "image_size": (SIZE, SIZE)} | changes
     clips = ClipDataset([walks], ClipPlan(**plan, clips_per_trajectory=2))
-    keys = CacheKeys({"encoding": "x"}, {"memory": "y"}, False)
+    keys = CacheKeys(latents={"encoding": "x"}, tokens={"memory": "y"}, whole_trajectories=False)
     return CachedClips(clips, ClipCache(TensorCache(CacheSettings(folder, 1)), keys))
 
 

@@ -10,7 +10,7 @@ from tests.support.micro_runs import SIZE
 
 
 def test_a_clip_is_the_same_after_its_way_through_one_tensor(walks):
-    clips = ClipDataset([walks], ClipPlan(9, (1,), 12, 3, (SIZE, SIZE)))
+    clips = ClipDataset([walks], ClipPlan(frames=9, strides=(1,), context_frames=12, seed=3, image_size=(SIZE, SIZE)))
     samples = [clips[number] for number in range(3)]
     packed = pack(samples)
     assert packed.tensors.dtype == torch.uint8

@@ -42,8 +42,6 @@ from persist_cli.simulators.collect import CollectPlan
 from persist_cli.viewing.console import add_task, busy, progress
 
 LOOPS: Final = ("closed", "open")
-
-
 SCENES: Final = "0:24"  # test houses in which episodes are drawn
 
 
@@ -78,8 +76,8 @@ class EpisodeSource:
         """
         if file is not None and (scenes is not None or each is not None):
             raise PersistError("--scenes and --each: of episodes that are drawn, not with --episodes, which has them")
-        search = EpisodeSearch(bins or EpisodeSearch.bins, EpisodeSearch.each if each is None else each)
-        houses = CollectPlan("miniworld", scenes or SCENES, split="test")
+        search = EpisodeSearch(bins=bins or EpisodeSearch.bins, each=EpisodeSearch.each if each is None else each)
+        houses = CollectPlan(simulator="miniworld", scenes=scenes or SCENES, split="test")
         return EpisodeSource(file, houses, search, tuple(bins) if bins else None)
 
     def identity(self, unset: bool = False) -> dict[str, Any]:
@@ -104,7 +102,7 @@ class EpisodeSource:
         return read_episodes(self.file).chosen(self.bins)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class BenchPlan:
     """The options of ``persist bench plan``.
 
@@ -139,7 +137,7 @@ class BenchPlan:
     allow_training_scenes: bool = False
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PlanningBench:
     """A benchmark that was checked and is ready to be run.
 
@@ -222,7 +220,10 @@ def prepare(plan: BenchPlan, out: Path, processes: Processes) -> PlanningBench:
         find_thresholds(plan, cost, rows, simulator, journal)
     processes.wait()  # the others find what the main process kept
     thresholds = find_thresholds(plan, cost, rows, simulator, journal)
-    return PlanningBench(plan, checkpoint, episodes, rows, policies, cost, simulator, journal, thresholds)
+    return PlanningBench(
+        plan=plan, checkpoint=checkpoint, episodes=episodes, rows=rows, policies=policies, cost=cost,
+        simulator=simulator, journal=journal, thresholds=thresholds,
+    )  # fmt: skip
 
 
 def open_policies(plan: BenchPlan, rows: Sequence[PlanningRow]) -> dict[str | None, Policy | None]:
@@ -263,9 +264,8 @@ def check_budget(plan: BenchPlan, rows: Sequence[PlanningRow], episodes: Episode
     longest = [one.bin for one in episodes.episodes if one.bin <= plan.loop.open_longest and "open" in plan.loops]
     needed, frames = max([plan.planning.horizon, *longest]), plan.planning.frames
     if frames is not None and frames < needed:
-        rest = (
-            "a shorter --horizon" if needed == plan.planning.horizon else "--loops closed: open loops plan all at once"
-        )
+        shorter = needed == plan.planning.horizon
+        rest = "a shorter --horizon" if shorter else "--loops closed: open loops plan all at once"
         raise PersistError(f"--frames {frames}: a plan has up to {needed} actions; give {needed} or more, or {rest}")
 
 

@@ -73,7 +73,7 @@ class RenderingPlan:
     placement: InferenceOptions
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SceneBenchPlan:
     """The options of ``persist bench scene``.
 
@@ -118,7 +118,7 @@ class SceneBenchPlan:
         return scene_config(form, plugin_settings(self.settings, ("memory",))["memory"])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SceneBench:
     """A benchmark that was checked and is ready to be run.
 
@@ -183,7 +183,7 @@ def prepare(plan: SceneBenchPlan, out: Path) -> SceneBench:
     if "evolution" in plan.parts:
         events = find_events(plan.data, {view.scene for view in views}, plan.interactions, plan.seed)
     journal.begin(identity(plan, views), part_identities(plan, houses, trained))
-    return SceneBench(plan, views, houses, journal, trained, events)
+    return SceneBench(plan=plan, views=views, houses=houses, journal=journal, trained=trained, events=events)
 
 
 def check_model(trained: TrainedSceneModel, files: Sequence[TrajectoryFile], allowed: bool) -> None:
@@ -254,7 +254,10 @@ def read_view(file: TrajectoryFile, frame: int, radius: float, scenes: Scenes) -
     truth = true_region(cells, region)
     near = near_camera(truth, image.cameras.centers[0], radius)
     name, sha256 = f"{file.name}:{frame}", file_sha256(file.path)
-    view = View(name, file.info.scene, file.info, image, region, truth, truth, near, cells, sha256)
+    view = View(
+        name=name, scene=file.info.scene, info=file.info, frame=image, region=region, known=truth, truth=truth,
+        near=near, house=cells, sha256=sha256,
+    )  # fmt: skip
     known = same_form(region.of(scenes.after(view).cells), truth.form, "the scene")
     return replace(view, known=known)
 

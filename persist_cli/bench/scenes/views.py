@@ -67,7 +67,7 @@ class Region:
         return torch.rot90(values, self.quarter, (0, 1))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class View:
     """One image of a held-out house.
 

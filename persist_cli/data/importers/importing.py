@@ -24,7 +24,7 @@ from persist_cli.viewing.console import add_task, print_json, print_table, progr
 MOST_CAUSES = 3  # that are printed for a trajectory
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ImportPlan:
     """Changes made to every trajectory while it is imported.
 
@@ -51,10 +51,13 @@ class ImportPlan:
 
     @staticmethod
     def of(
-        size: str | None, every: int, step: float | None, turn: float | None, skip_bad: bool, hold_out: float = 0.0
+        *, size: str | None, every: int, step: float | None, turn: float | None, skip_bad: bool, hold_out: float = 0.0
     ) -> ImportPlan:
         """Return the plan of the command's options; ``size`` is ``HEIGHTxWIDTH`` in pixels."""
-        return ImportPlan(parse_size(size) if size else None, every, step, turn, skip_bad, hold_out)
+        return ImportPlan(
+            size=parse_size(size) if size else None, every=every, step=step, turn=turn, skip_bad=skip_bad,
+            hold_out=hold_out,
+        )  # fmt: skip
 
     def parts(self, out: Path) -> list[tuple[ImportPlan, Path]]:
         """What is written and where: all into ``out``, or with frames held out a training and a test part into it."""

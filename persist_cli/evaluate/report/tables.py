@@ -69,7 +69,7 @@ class ColumnView:
     fewest: int = 0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RowView:
     """A row with its cells; ``missing`` when the row cannot be made of these clips.
 
@@ -90,7 +90,7 @@ class RowView:
         return self.name if self.trained < 2 else f"{self.name} ({self.trained} training seeds)"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TableView:
     """A table; ``notes`` are the reasons of its ``n/a`` cells by their number, which all tables share.
 
@@ -240,14 +240,18 @@ def _view_table(results: EvalResults, table: TableRecord, notes: list[str]) -> T
     for name in names:
         row = table.rows[name]
         trained = len(row.training_seeds) or 1
-        reference = name == results.first_row
-        rows.append(RowView(name, row.kind, row.definition, reference, cells[name], row.na is not None, trained))
+        rows.append(RowView(
+            name=name, kind=row.kind, definition=row.definition, reference=name == results.first_row, cells=cells[name],
+            missing=row.na is not None, trained=trained,
+        ))  # fmt: skip
     columns = [_column_head(results, key, table) for key in results.columns]
     used_notes = sorted({cell.note for row in rows for cell in row.cells} - {0})
     unit = results.statistics.resampled
     units = len(table.clips) if unit == "clips" else table_scenes(results, table)
     own_notes = {number: notes[number - 1] for number in used_notes}
-    return TableView(table.name, len(table.clips), unit, units, columns, rows, own_notes)
+    return TableView(
+        name=table.name, clips=len(table.clips), unit=unit, units=units, columns=columns, rows=rows, notes=own_notes
+    )
 
 
 def table_scenes(results: EvalResults, table: TableRecord) -> int:

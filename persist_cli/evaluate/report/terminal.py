@@ -51,7 +51,7 @@ class TableLine:
     cells: Mapping[str, CellView]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TerminalTable:
     """The texts of the table, headings first, and what they show.
 
@@ -138,7 +138,7 @@ def terminal_table(results: EvalResults, width: int) -> TerminalTable:
     for key in [*chosen, *more]:
         columns += [shown[key], *([gaps[key]] if key in with_gaps else [])]
     texts = [list(texts) for texts in zip(*columns, strict=True)]
-    return TerminalTable(texts, kind_changes(lines), bool(with_gaps), deviations)
+    return TerminalTable(texts=texts, sections=kind_changes(lines), differences=bool(with_gaps), deviations=deviations)
 
 
 def table_lines(tables: Sequence[CompactTable]) -> list[TableLine]:

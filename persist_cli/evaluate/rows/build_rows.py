@@ -61,7 +61,7 @@ NOISY_WARP = "warp of noisy poses"  # stands beside the controls of noisy memori
 OBSTACLES = {"shuffled": one_scene, "warp": no_depth, "true-cells": no_cells}  # of controls that not all clips allow
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RowConfig:
     """Names of the memories and controls that become rows, and how their clips are sampled.
 

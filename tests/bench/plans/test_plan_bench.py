@@ -158,7 +158,10 @@ def test_two_rows_that_would_be_kept_in_one_place_are_refused(bench: Bench, tmp_
 
 def test_rows_of_one_folder_are_refused_before_any_is_run() -> None:
     memories = ("voxel_2", "none", "voxel-2")
-    rows = [PlanningRow(f"rank-8, {name}", "rank", "random", name, "image", False) for name in memories]
+    rows = [
+        PlanningRow(name=f"rank-8, {name}", planner="rank", policy="random", memory=name, goal="image", walk=False)
+        for name in memories
+    ]
     check_row_folders(rows[:2])
     with pytest.raises(DataError, match="'rank-8, voxel_2' and 'rank-8, voxel-2' would be kept in one folder"):
         check_row_folders(rows)

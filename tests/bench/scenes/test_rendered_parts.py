@@ -139,8 +139,10 @@ def test_fvd_takes_as_many_pieces_of_each_row_as_there_are_true_ones(monkeypatch
 
 def test_houses_seen_in_few_frames_have_no_true_pieces(tmp_path: Path) -> None:
     data = write_cell_houses(tmp_path / "short", [5], frames=16)
-    plan = SceneBenchPlan(None, str(data), None, ("return",), radius=2)
-    bench = SceneBench(plan, read_views(chosen_files(plan), plan), [], SceneJournal(tmp_path / "out"))
+    plan = SceneBenchPlan(model=None, data=str(data), train=None, parts=("return",), radius=2)
+    bench = SceneBench(
+        plan=plan, views=read_views(chosen_files(plan), plan), houses=[], journal=SceneJournal(tmp_path / "out")
+    )
     assert true_pieces(bench) == []
 
 

@@ -59,7 +59,7 @@ def kitchen(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if not KITCHEN.is_dir():
         pytest.skip("needs the real Kinect frames of ../shared/data/kitchen")
     folder = tmp_path_factory.mktemp("kitchen")
-    run_import("7scenes", KITCHEN, folder, ImportPlan((120, 160), 5), False)
+    run_import("7scenes", KITCHEN, folder, ImportPlan(size=(120, 160), every=5), False)
     return folder / "kitchen.parquet"
 
 

@@ -124,7 +124,7 @@ def test_an_unknown_format_gets_a_hint(tmp_path: Path) -> None:
 
 
 def test_import_writes_a_store_of_the_size_given(sequence: Path, tmp_path: Path, capsys) -> None:
-    run_import("7scenes", sequence, tmp_path / "out", ImportPlan((24, 24), 2), True)
+    run_import("7scenes", sequence, tmp_path / "out", ImportPlan(size=(24, 24), every=2), True)
     report = json.loads(capsys.readouterr().out)
     assert report["trajectories"] == [
         {
@@ -150,7 +150,7 @@ def test_a_second_import_leaves_finished_trajectories_alone(sequence: Path, tmp_
     assert "already there" in capsys.readouterr().out
     assert (tmp_path / "out/kitchen.parquet").stat().st_mtime_ns == written
     with pytest.raises(DataError, match="of other settings"):
-        run_import("7scenes", sequence, tmp_path / "out", ImportPlan((24, 24)), False)
+        run_import("7scenes", sequence, tmp_path / "out", ImportPlan(size=(24, 24)), False)
 
 
 LOST = "-1.#IND " * 16

@@ -1,4 +1,4 @@
-"""The commands of ``persist weights``: signatures only, as in ``app``, which takes them up."""
+"""The commands that list what there is, and bring weights: signatures only, as in ``app``, which takes them up."""
 
 from __future__ import annotations
 
@@ -9,9 +9,37 @@ import typer
 
 from persist_cli.cli.options import JsonOption
 
+catalog_app = typer.Typer()
 weights_app = typer.Typer(
     no_args_is_help=True, help="Weights of encoders, metrics, policies: what there is, fetch, path."
 )
+catalog_app.add_typer(weights_app, name="weights")
+
+
+@catalog_app.command()
+def plugins(json: JsonOption = False) -> None:
+    """List every plugin: backbones, memories, encoders, simulators, importers, policies, costs, scene models."""
+    from persist_cli.viewing.listings import show_plugins
+
+    show_plugins(json)
+
+
+@catalog_app.command()
+def recipes(
+    name: Annotated[str | None, typer.Argument(help="A recipe, or a YAML file, to show with every setting.")] = None,
+    json: JsonOption = False,
+) -> None:
+    """List the recipes that come with persist, or show one with every setting, as YAML to start from.
+
+    persist recipes tiny-stage1 > mine.yaml
+    """
+    if name is None:
+        from persist_cli.viewing.listings import show_recipes
+
+        return show_recipes(json)
+    from persist_cli.viewing.recipe_page import show_recipe
+
+    show_recipe(name, json)
 
 
 @weights_app.command("list")
