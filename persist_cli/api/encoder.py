@@ -10,6 +10,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from persist_cli.api.promises import check_features
+from persist_cli.errors import PluginError
 from persist_cli.io.settings import NoSettings
 
 
@@ -51,6 +52,17 @@ class Encoder(ABC):
         features = self.encode(rgb)
         check_features(features, self.name, self.channels, len(rgb))
         return features
+
+    def placed(self, device: torch.device | str) -> Encoder:
+        """Return what ``to`` does, after a check that it is an encoder. Persist moves encoders by this method.
+
+        Raises:
+            PluginError: when it is not.
+        """
+        moved: Any = self.to(device)
+        if not isinstance(moved, Encoder):
+            raise PluginError(f"encoder {self.name!r}: to gave {type(moved).__name__}; it must return an encoder")
+        return moved
 
     def to(self, device: torch.device | str) -> Encoder:
         """Return the encoder on ``device``; by default, without weights of its own, it stays as it is."""

@@ -198,9 +198,20 @@ class Memory(ABC):
 
     def to(self, device: torch.device | str) -> Self:
         """Move this memory and its encoder to ``device`` and return it; an empty one follows the frames written."""
-        self.encoder = self.encoder.to(device)
+        self.encoder = self.encoder.placed(device)
         self.restore({name: tensor.to(device) for name, tensor in self.tensors().items()})
         return self
+
+    def placed(self, device: torch.device | str) -> Self:
+        """Return what ``to`` does, after a check that it is this memory. Persist moves memories by this method.
+
+        Raises:
+            PluginError: when it is not.
+        """
+        moved = self.to(device)
+        if moved is not self:
+            raise PluginError(f"memory {self.name!r}: to gave {type(moved).__name__}; it must return the memory itself")
+        return moved
 
     def merge(self, other: Memory) -> None:
         """Add the content of another memory, of one kind and reference; ``CheckpointError`` when they do not match."""

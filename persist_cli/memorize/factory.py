@@ -58,7 +58,7 @@ class MemoryFactory:
             _KEPT.move_to_end(key)
             while len(_KEPT) > MOST_KEPT:
                 _KEPT.popitem(last=False)
-        return MemoryFactory(kind, settings, encoder.to(device), device)
+        return MemoryFactory(kind, settings, encoder.placed(device), device)
 
     def empty(self, info: TrajectoryInfo) -> Memory:
         """Return an empty memory in the world of a trajectory."""

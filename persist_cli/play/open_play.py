@@ -83,7 +83,7 @@ def open_walks(options: PlayOptions) -> Callable[[], Play]:
     with busy("loading the model"):
         backbone = _load(checkpoint, names)
     backbone.prepare_inference(options.placement)
-    placed = {name: memory and memory.to(backbone.device) for name, memory in memories.items()}
+    placed = {name: memory and memory.placed(backbone.device) for name, memory in memories.items()}
     sampling, body = checkpoint.sampling_with(SamplingOverrides()), body_for(options.begin.world, start.info)
     settings = options.settings
     if options.own_steps and sampling.sampler == CONSISTENCY:

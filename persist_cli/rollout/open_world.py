@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.memorize.memory_file import load_memory
 from persist_cli.navigation.ground_mapper import body_of, tells_body
 from persist_cli.rollout.world_model import Agent, WorldModel
-from persist_cli.viewing.console import busy
+from persist_cli.viewing.console import busy, warn
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,7 +125,7 @@ def world_with(
     sampling = checkpoint.sampling_with(options.sampling)
     backbone.check_sampling(sampling)
     backbone.prepare_inference(options.placement)
-    agent = Agent(memory and memory.to(backbone.device), options.seed, options.write, body=body_for(options, info))
+    agent = Agent(memory and memory.placed(backbone.device), options.seed, options.write, body=body_for(options, info))
     return WorldModel(backbone, [agent], sampling)
 
 
@@ -145,6 +145,7 @@ def open_memory(
     check_memory(read_header(options.memory), empty, checkpoint, options.memory)
     memory = load_memory(options.memory)
     check_cells(memory, empty, options.memory)
+    warn_of_settings(memory, empty, options.memory)
     return memory
 
 
@@ -177,6 +178,21 @@ def check_cells(memory: Memory, wanted: Memory, path: Path) -> None:
     raise CheckpointError(
         f"{path}: its classes of cells are not those that the adapter draws; they differ in {', '.join(other)}"
     )
+
+
+def warn_of_settings(memory: Memory, wanted: Memory, path: Path) -> None:
+    """Warn when a memory was made with other settings than those that the adapter was made for.
+
+    Args:
+        memory: the memory of a file.
+        wanted: an empty memory as the adapter reads it.
+        path: the file.
+    """
+    own, its = asdict(memory.settings), asdict(wanted.settings)
+    other = [name for name, value in own.items() if name not in memory.changeable and value != its.get(name)]
+    if other:
+        settings = ", ".join(f"memory.{name} is {own[name]}, there {its.get(name)}" for name in other)
+        warn(f"{path}: made with other settings than the adapter's, which may draw it worse: {settings}")
 
 
 def check_memory(header: Mapping[str, Any], wanted: Memory, checkpoint: Checkpoint, path: Path) -> None:

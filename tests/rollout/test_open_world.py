@@ -10,11 +10,12 @@ from persist_cli.api.ground import Body
 from persist_cli.api.inference import SamplingOverrides
 from persist_cli.api.observations import Frame
 from persist_cli.data.store import Store, write_trajectory
-from persist_cli.errors import CheckpointError, PersistError
+from persist_cli.errors import CheckpointError, PersistError, PluginError
 from persist_cli.memorize.memory_file import load_memory
 from persist_cli.rollout.open_world import open_world
 from persist_cli.viewing.video import read_video
 from tests.support.micro_runs import SIZE
+from tests.support.room_views import empty_memory
 
 FAST = SamplingOverrides(steps=2)
 
@@ -59,3 +60,20 @@ def test_a_world_is_not_opened_with_the_memory_of_another_scene(persist, voxel, 
         open_world(f"{walks}#1:0", voxel, memory=memory)
     with pytest.raises(PersistError, match="no checkpoint there"):
         open_world(f"{walks}#0:0", tmp_path / "none")
+
+
+def test_a_memory_of_other_settings_than_the_adapters_is_read_with_a_warning(persist, voxel, walks, tmp_path):
+    file, cells = tmp_path / "coarse.safetensors", ("--set", "memory.cell=[0.5,0.5,0.5]")
+    made = persist("memorize", f"{walks}#0:0-3", "--memory", "voxel", *cells, "--out", file)
+    assert made.code == 0, made.err
+    step = ("--start", f"{walks}#0:4", "--actions", "left", "--steps", 1)
+    ended = persist("rollout", voxel, *step, "--memory", file, "--out", tmp_path / "out")
+    assert ended.code == 0, ended.err
+    assert f"{file}: made with other settings than the adapter's, which may draw it worse: memory.cell is" in ended.err
+
+
+def test_a_memory_that_is_lost_where_it_is_moved_is_an_error():
+    memory = empty_memory("voxel")
+    memory.to = lambda device: None
+    with pytest.raises(PluginError, match=r"memory 'voxel': to gave NoneType; it must return the memory itself"):
+        memory.placed("cpu")
