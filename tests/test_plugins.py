@@ -226,6 +226,14 @@ def test_an_exception_in_a_plugin_is_one_line_that_says_where(persist, site, wal
     assert "Traceback" in persist(*arguments).err
 
 
+def test_an_error_of_several_lines_is_printed_in_one(persist, site, walks):
+    writing = "self.frame = self.encoder.encode(observations.rgb[-1:])[0].flatten(0, 1)"
+    told = "from persist_cli.errors import DataError; raise DataError('no\\nframe')"
+    install(site, "persist-last", "persist.memories", "last = lines_frame:LastFrame", LAST_FRAME.replace(writing, told))
+    ended = persist("memorize", f"{walks}#0:0-3", "--memory", "last", "--out", site / "m.safetensors")
+    assert (ended.code, ended.err) == (1, "error: no frame\n")
+
+
 def test_an_exception_that_passed_through_no_plugin_keeps_its_traceback():
     with pytest.raises(ZeroDivisionError), plugin_errors():
         _ = 1 / 0

@@ -86,7 +86,8 @@ def main(arguments: list[str] | None = None) -> None:
     except PersistError as error:
         if os.environ.get(TRACEBACK):
             traceback.print_exc()
-        typer.secho(f"error: {error}", fg=typer.colors.RED, err=True)
+        line = " ".join(str(error).split("\n"))  # a plugin's message may have several
+        typer.secho(f"error: {line}", fg=typer.colors.RED, err=True)
         sys.exit(1)
 
 
