@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from persist_cli.api.checkpoint import TrainingScenes, run_folder, step_folders
+from persist_cli.api.checkpoint import run_folder, step_folders
+from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import file_sha256, read_json, write_json
 

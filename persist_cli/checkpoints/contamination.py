@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from persist_cli.api.checkpoint import Checkpoint, TrainingScenes
+from persist_cli.api.checkpoint import Checkpoint
+from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.checkpoints.lineage import training_scenes
 from persist_cli.data.held_out import SEQUENCE, scene_was_trained_on
 from persist_cli.data.store import TrajectoryFile

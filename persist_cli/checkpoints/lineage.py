@@ -7,7 +7,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
-from persist_cli.api.checkpoint import Checkpoint, TrainingScenes, find_checkpoint, read_card
+from persist_cli.api.checkpoint import Checkpoint, find_checkpoint, read_card
+from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.checkpoints.scene_models import find_scene_model, with_model_beside
 from persist_cli.data.held_out import trained_scene
 from persist_cli.data.reference import data_folder

@@ -9,8 +9,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from persist_cli.api.checkpoint import CARD, REFERENCE, STARTED_FROM, VERSION, Checkpoint, TrainingScenes
+from persist_cli.api.checkpoint import CARD, REFERENCE, STARTED_FROM, VERSION, Checkpoint
 from persist_cli.api.inference import CONSISTENCY
+from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.checkpoints.lineage import MEMORY_FILE
 from persist_cli.io.files import bundled_folder, write_json
 from persist_cli.io.sha256sums import hash_files, write_sums

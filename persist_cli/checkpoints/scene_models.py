@@ -10,11 +10,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from persist_cli.api.checkpoint import SCENE_CARD, TrainingScenes
+from persist_cli.api.checkpoint import SCENE_CARD
 from persist_cli.api.meta_device import without_weights
 from persist_cli.api.network_card import CardKind, card_folder, find_card, write_card
 from persist_cli.api.scene_model import SceneForm, SceneModel
 from persist_cli.api.stages import SCENE_STAGES, Stage
+from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.errors import CheckpointError, RecipeError
 from persist_cli.io.files import bundled_folder
 from persist_cli.io.sha256sums import check_sums, write_sums

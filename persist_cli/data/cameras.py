@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
-from persist_cli.api.checkpoint import TrainingScenes
 from persist_cli.api.observations import TrajectoryInfo
+from persist_cli.api.training_scenes import TrainingScenes
 
 TOLERANCE = 5.0  # degrees by which a view may be narrower or wider than those of the training
 

@@ -9,9 +9,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from persist_cli.api.checkpoint import POLICY_CARD, TrainingScenes
+from persist_cli.api.checkpoint import POLICY_CARD
 from persist_cli.api.network_card import CardKind, card_folder, find_card, write_card
 from persist_cli.api.policy_network import PolicyNetwork
+from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import bundled_folder
 from persist_cli.io.settings import parse_settings

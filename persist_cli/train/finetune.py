@@ -22,7 +22,6 @@ from persist_cli.api.backbone import Backbone
 from persist_cli.api.checkpoint import (
     PLAIN,
     Checkpoint,
-    TrainingScenes,
     base_pointer,
     find_checkpoint,
     read_card,
@@ -33,6 +32,7 @@ from persist_cli.api.meta_device import without_weights
 from persist_cli.api.policy_network import PolicyNetwork
 from persist_cli.api.scene_model import SceneModel
 from persist_cli.api.stages import SCENE_STAGES
+from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.checkpoints.load import (
     add_adapter,
     is_distilled,

@@ -7,8 +7,8 @@ from typing import Any
 
 from accelerate import Accelerator
 
-from persist_cli.api.checkpoint import TrainingScenes
 from persist_cli.api.policy_network import PolicyNetwork, PolicySamples
+from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.checkpoints.lineage import Lineage
 from persist_cli.data.held_out import trained_scene
 from persist_cli.data.policy_samples import PolicySampleDataset

@@ -7,7 +7,8 @@ from typing import Any
 
 from safetensors import SafetensorError
 
-from persist_cli.api.checkpoint import Checkpoint, TrainingScenes, step_folders
+from persist_cli.api.checkpoint import Checkpoint, step_folders
+from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.checkpoints.lineage import RECIPE, Lineage, stage_recipes, training_scenes
 from persist_cli.checkpoints.retention import KeptCheckpoint, ended_recipe, kept_checkpoints, remove_superseded
 from persist_cli.errors import PersistError

@@ -8,8 +8,8 @@ from typing import Any, Final
 
 from accelerate import Accelerator
 
-from persist_cli.api.checkpoint import TrainingScenes
 from persist_cli.api.scene_model import SceneModel, SceneSamples
+from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.checkpoints.lineage import Lineage
 from persist_cli.checkpoints.scene_models import save_scene_model
 from persist_cli.data.held_out import trained_scene

@@ -10,7 +10,7 @@ import torch
 from accelerate import Accelerator
 
 from persist_cli.api.backbone import Backbone, Clips
-from persist_cli.api.checkpoint import TrainingScenes
+from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.checkpoints.lineage import Lineage, save_stage_recipes
 from persist_cli.checkpoints.save import save_adapter, save_base, save_lora
 from persist_cli.data.augment import Augmentation

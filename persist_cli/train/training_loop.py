@@ -18,8 +18,8 @@ from accelerate import Accelerator
 from torch import nn
 from torch.utils.data import DataLoader, Dataset
 
-from persist_cli.api.checkpoint import TrainingScenes
 from persist_cli.api.promises import check_losses
+from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.checkpoints.lineage import Lineage
 from persist_cli.data.clips import DistributedBatches
 from persist_cli.errors import PersistError

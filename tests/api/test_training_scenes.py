@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from persist_cli.api.checkpoint import TrainingScenes, name_ranges
+from persist_cli.api.training_scenes import TrainingScenes, name_ranges
 
 HOUSES = [f"miniworld/house-{number}" for number in range(2400)]
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from persist_cli.api.checkpoint import TrainingScenes
+from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.data.cameras import unfamiliar_view, vertical_view
 from tests.support.rooms import Room
 

@@ -6,7 +6,7 @@ import os
 from hashlib import sha256
 from pathlib import Path
 
-from persist_cli.api.checkpoint import TrainingScenes
+from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.data.reference import parse_reference
 
 

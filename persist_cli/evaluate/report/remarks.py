@@ -6,7 +6,8 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from persist_cli.api.checkpoint import name_ranges, run_folder
+from persist_cli.api.checkpoint import run_folder
+from persist_cli.api.training_scenes import name_ranges
 from persist_cli.evaluate.report.result_file import CheckpointRecord, EvalResults, SamplingSettings
 from persist_cli.evaluate.report.tables import MARK, CompactTable, TableView, compact_tables
 from persist_cli.evaluate.statistics import LEAST_MODELS, LEAST_UNITS
