@@ -92,7 +92,7 @@ def view_costs(cost: Cost, views: Observations, goal: Goal) -> list[float]:
 
 
 @dataclass(frozen=True)
-class Approach:
+class ValidationCosts:
     """What views of one validation episode cost.
 
     Args:
@@ -172,28 +172,28 @@ class StopThresholds:
         ]
 
 
-def choose_threshold(approaches: Sequence[Approach], metres: float = SUCCESS_METRES) -> StopThreshold:
+def choose_threshold(measured: Sequence[ValidationCosts], metres: float = SUCCESS_METRES) -> StopThreshold:
     """Return the threshold at which most near views cost little enough and no view from too far, the middle of equals.
 
     Args:
-        approaches: of validation episodes.
+        measured: of validation episodes.
         metres: ``SUCCESS_METRES`` or ``APPROACH_METRES``, from where on a view is too far.
 
     Raises:
-        PersistError: without approaches.
+        PersistError: without any.
     """
-    if not approaches:
+    if not measured:
         raise PersistError("no validation episode was found to choose when to stop; give --stop-cost")
-    near = np.array([approach.near for approach in approaches])
-    far = np.array([approach.far if metres == SUCCESS_METRES else approach.farther for approach in approaches])
+    near = np.array([costs.near for costs in measured])
+    far = np.array([costs.far if metres == SUCCESS_METRES else costs.farther for costs in measured])
     costs = np.unique(near)
     counts = np.array([((near <= cost) & (cost < far)).sum() for cost in costs])
     best = np.flatnonzero(counts == counts.max())
     chosen = best[len(best) // 2]
-    return StopThreshold(float(costs[chosen]), metres, int(counts[chosen]), len(approaches))
+    return StopThreshold(float(costs[chosen]), metres, int(counts[chosen]), len(measured))
 
 
-def approach(scene: TrueScene, cost: Cost) -> Approach | None:
+def validation_costs(scene: TrueScene, cost: Cost) -> ValidationCosts | None:
     """Return what the views of an episode cost; ``None`` where nothing beside the goal is free."""
     walk, vocabulary = scene.episode.walk, scene.info.vocabulary
     stand(scene.simulator, walk.start)
@@ -206,7 +206,7 @@ def approach(scene: TrueScene, cost: Cost) -> Approach | None:
         return None
     *costs, last = view_costs(cost, Observations.concatenate([*(view for view, _ in far), near]), scene.goal)
     farther = [value for value, (_, metres) in zip(costs, far, strict=True) if metres > APPROACH_METRES]
-    return Approach(min(costs), min(farther, default=math.inf), last)
+    return ValidationCosts(min(costs), min(farther, default=math.inf), last)
 
 
 def look_beside(scene: TrueScene) -> Observations | None:
@@ -235,6 +235,6 @@ def stop_thresholds(simulator: Simulator, cost: Cost) -> StopThresholds:
     Raises:
         PersistError: when these houses have no episodes, or a cost is NaN.
     """
-    tried = [approach(TrueScene(simulator, episode), cost) for episode in validation_episodes(simulator)]
-    approaches = [one for one in tried if one is not None]
-    return StopThresholds(choose_threshold(approaches), choose_threshold(approaches, APPROACH_METRES))
+    tried = [validation_costs(TrueScene(simulator, episode), cost) for episode in validation_episodes(simulator)]
+    measured = [one for one in tried if one is not None]
+    return StopThresholds(choose_threshold(measured), choose_threshold(measured, APPROACH_METRES))

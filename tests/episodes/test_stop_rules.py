@@ -11,13 +11,13 @@ from persist_cli.api.policy import Goal
 from persist_cli.episodes.episodes import Episode
 from persist_cli.episodes.stop_rules import (
     APPROACH_METRES,
-    Approach,
     StopAtPlace,
     StopByCost,
     StopThreshold,
     StopThresholds,
-    approach,
+    ValidationCosts,
     choose_threshold,
+    validation_costs,
 )
 from persist_cli.episodes.true_scene import TrueScene
 from persist_cli.errors import PersistError
@@ -28,10 +28,14 @@ UP = (0.0, 1.0, 0.0)
 
 
 def test_the_threshold_is_one_at_which_most_agents_stop_near_and_only_there() -> None:
-    approaches = [Approach(5.0, 9.9, near=1.0), Approach(4.0, 9.9, near=2.0), Approach(1.5, 9.9, near=9.0)]
-    chosen = choose_threshold(approaches)
+    measured = [
+        ValidationCosts(5.0, 9.9, near=1.0),
+        ValidationCosts(4.0, 9.9, near=2.0),
+        ValidationCosts(1.5, 9.9, near=9.0),
+    ]
+    chosen = choose_threshold(measured)
     assert (chosen.value, chosen.successes, chosen.episodes) == (2.0, 2, 3)
-    farther = choose_threshold(approaches, APPROACH_METRES)  # who still approaches may begin sooner
+    farther = choose_threshold(measured, APPROACH_METRES)  # who still measured may begin sooner
     assert (farther.value, farther.successes, farther.metres) == (9.0, 3, APPROACH_METRES)
 
 
@@ -66,6 +70,6 @@ def test_an_agent_that_is_shown_the_goal_stops_at_its_view(small_world: MiniWorl
 
 
 def test_a_view_beside_the_goal_costs_less_than_most(small_world: MiniWorld, found: list[Episode]) -> None:
-    costs = [approach(TrueScene(small_world, episode), PixelCost(None)) for episode in found]
-    assert costs == [approach(TrueScene(small_world, episode), PixelCost(None)) for episode in found]
+    costs = [validation_costs(TrueScene(small_world, episode), PixelCost(None)) for episode in found]
+    assert costs == [validation_costs(TrueScene(small_world, episode), PixelCost(None)) for episode in found]
     assert all(one is not None and one.near > 0 and one.far > 0 for one in costs)
