@@ -116,19 +116,31 @@ def invert_rigid(transform: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batc
 
 def check_poses(poses: Float[Tensor, "frame 4 4"], where: str) -> None:
     """Raise ``DataError``, which begins with ``where``, when a pose is not a finite rigid transform (within 1 %)."""
-    if not torch.isfinite(poses).all():
-        frame = int((~torch.isfinite(poses).all(-1).all(-1)).nonzero()[0])
-        raise DataError(f"{where}: the pose of frame {frame} is not finite")
+    flawed = _first_flaw(poses)
+    if flawed is not None:
+        raise DataError(f"{where}: the pose of frame {flawed[0]} is {flawed[1]}")
+
+
+def check_pose(pose: Float[Tensor, "4 4"], where: str) -> None:
+    """Raise ``DataError`` as ``check_poses`` does, for a single pose."""
+    flawed = _first_flaw(pose[None])
+    if flawed is not None:
+        raise DataError(f"{where}: the pose is {flawed[1]}")
+
+
+def _first_flaw(poses: Float[Tensor, "frame 4 4"]) -> tuple[int, str] | None:
+    """Return the number of the first pose that is no finite rigid transform, and what it is; ``None`` without one."""
+    finite = torch.isfinite(poses).all(-1).all(-1)
+    if not finite.all():
+        return int((~finite).nonzero()[0]), "not finite"
     rotation = poses[:, :3, :3]
     identity = torch.eye(3, dtype=poses.dtype)
     skew = (rotation @ rotation.transpose(1, 2) - identity).abs().amax((1, 2))
     bottom = (poses[:, 3] - poses.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().amax(1)
     bad = (skew > RIGID_TOLERANCE) | (bottom > RIGID_TOLERANCE) | (torch.linalg.det(rotation) < 0)
-    if bad.any():
-        raise DataError(
-            f"{where}: the pose of frame {int(bad.nonzero()[0])} is not rigid (rotation and translation "
-            "only, no scale or mirror)"
-        )
+    if not bad.any():
+        return None
+    return int(bad.nonzero()[0]), "not rigid (rotation and translation only, no scale or mirror)"
 
 
 def check_intrinsics(intrinsics: Float[Tensor, "3 3"], where: str) -> None:

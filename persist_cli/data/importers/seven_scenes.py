@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from persist_cli.api.actions import FREE, free_motion
-from persist_cli.api.cameras import check_intrinsics, check_poses
+from persist_cli.api.cameras import check_intrinsics, check_pose
 from persist_cli.api.importer import ForeignTrajectory, Importer
 from persist_cli.api.observations import Frame, TrajectoryInfo
 from persist_cli.data.importers.gravity import Array, Direction, estimate_up, level_up
@@ -134,9 +134,9 @@ def _pose(frame: FrameFiles) -> Array | DataError:
     """The frame's pose, or the error that names its file and why the pose cannot be used."""
     try:
         pose = read_matrix(frame.pose, 4, 4)
-        check_poses(torch.from_numpy(pose)[None], str(frame.pose))
+        check_pose(torch.from_numpy(pose), str(frame.pose))
     except DataError as error:
-        return DataError(str(error).replace("the pose of frame 0", "the pose"))
+        return error
     return pose
 
 
