@@ -16,8 +16,8 @@ class ForeignTrajectory:
     """One trajectory of a foreign data set; a frame is read when the iterator comes to it.
 
     Args:
-        name: unique within the data set; it becomes a file's, so it has no ``/``, ``\\``, ``#`` or ``:`` and no dot at its
-            beginning.
+        name: unique within the data set. It becomes a file's name, so it has no slash, backslash, ``#`` or ``:``, and
+            no dot at its beginning.
         info: scene, camera and vocabulary, which all frames share.
         frames: every frame in order, converted to OpenCV axes, metres and planar z. In the place of a frame that cannot
             be used stands the error that says why: the command raises it, or leaves the frame out with ``--skip-bad``.
