@@ -138,6 +138,13 @@ def test_an_unfinished_plugin_is_shown_as_broken_and_refused_in_one_line(persist
     assert (error.value.package, error.value.cause) == ("persist-unfinished", cause)
 
 
+@pytest.mark.parametrize("target", ["unfinished", "unfinished:"])
+def test_an_entry_point_without_a_class_is_said_to_need_one(persist, site, target):
+    install(site, "persist-unfinished", "persist.memories", f"unfinished = {target}", UNFINISHED)
+    rows = {row["name"]: row for row in json.loads(persist("plugins", "--json").out)}
+    assert rows["unfinished"]["state"] == "its entry point names no class; write module:class"
+
+
 def test_every_plugin_of_persist_can_be_used(persist):
     rows = json.loads(persist("plugins", "--json").out)
     unusable = [row for row in rows if row["state"] != "ok"]
