@@ -17,6 +17,10 @@ from persist_cli.plugins import find_plugin
 
 NAME = re.compile(r"[^./\\#:\x00-\x1f\x7f][^/\\#:\x00-\x1f\x7f]*")
 LONGEST_NAME = 200  # bytes; file systems take 255, and a file that is being written has a longer name
+FIT_NAME = (
+    "a name is one of a file, without / \\ # : and control characters, without a dot at its beginning, of 1 to "
+    f"{LONGEST_NAME} bytes"
+)
 
 
 def checked_trajectories(importer: Importer, source: Path) -> Iterator[ForeignTrajectory]:
@@ -39,16 +43,18 @@ def checked_trajectories(importer: Importer, source: Path) -> Iterator[ForeignTr
         raise DataError(f"{source}: {find_plugin('importer', importer.name)} finds no trajectory there")
 
 
+def is_fit_name(name: str) -> bool:
+    """Whether a trajectory can have this name: it names a file in the data set's folder, and stands in references."""
+    return NAME.fullmatch(name) is not None and len(name.encode("utf-8", "replace")) <= LONGEST_NAME
+
+
 def _check_trajectory(trajectory: Any, names: set[str]) -> None:
     """Raise ``DataError`` unless something is a trajectory, of none of the names that were given before."""
     if not isinstance(trajectory, ForeignTrajectory):
         raise DataError(f"it yields {shown(trajectory)}, no ForeignTrajectory")
     name, where = trajectory.name, f"trajectory {shown(trajectory.name)}"
-    if not isinstance(name, str) or not NAME.fullmatch(name) or len(name.encode()) > LONGEST_NAME:
-        raise DataError(
-            f"it names a trajectory {shown(name)}; a name is one of a file, without / \\ # : and control characters, "
-            f"without a dot at its beginning, of 1 to {LONGEST_NAME} bytes"
-        )
+    if not isinstance(name, str) or not is_fit_name(name):
+        raise DataError(f"it names a trajectory {shown(name)}; {FIT_NAME}")
     if name in names:
         raise DataError(f"it yields two trajectories of the name {name!r}; names are unique in a data set")
     check_info(trajectory.info, where)
