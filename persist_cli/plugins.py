@@ -142,6 +142,9 @@ def import_plugin(plugin: Plugin) -> type[Any]:
         PluginError: when that fails, or the class is not of the plugin's kind.
     """
     base = _resolve(KINDS[plugin.kind].base)
+    if not plugin.target.partition(":")[2]:
+        cause = "its entry point names no class; write module:class"
+        raise plugin.error(f"is broken: {cause}", cause)
     try:
         loaded = _resolve(plugin.target)
     except (Exception, SystemExit) as error:  # the module of another package may raise anything

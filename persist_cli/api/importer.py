@@ -16,11 +16,12 @@ class ForeignTrajectory:
     """One trajectory of a foreign data set; a frame is read when the iterator comes to it.
 
     Args:
-        name: unique within the data set and fit for a file name.
+        name: unique within the data set. It becomes a file's name, so it has no slash, backslash, ``#`` or ``:``, and
+            no dot at its beginning.
         info: scene, camera and vocabulary, which all frames share.
         frames: every frame in order, converted to OpenCV axes, metres and planar z. In the place of a frame that cannot
             be used stands the error that says why: the command raises it, or leaves the frame out with ``--skip-bad``.
-        length: number of frames, those that cannot be used included.
+        length: number of frames, those that cannot be used included; ``frames`` yields exactly so many.
     """
 
     name: str

@@ -23,7 +23,8 @@ from persist_cli.api.cameras import Cameras, check_poses
 from persist_cli.api.cells import CellForm, CellGrid
 from persist_cli.api.observations import Frame, Observations, Trajectory, TrajectoryInfo
 from persist_cli.data.images import decode_depth, decode_rgb, encode_depth, encode_rgb
-from persist_cli.data.store_header import CELLS, COLUMNS, METADATA_KEY, check_info, read_info, schema
+from persist_cli.data.storable import check_frame, check_info
+from persist_cli.data.store_header import CELLS, COLUMNS, METADATA_KEY, read_info, schema
 from persist_cli.data.stored_cells import CellBox, encode_cells
 from persist_cli.errors import DataError, nearest_name
 from persist_cli.io.files import ASIDE, written_aside
@@ -294,8 +295,7 @@ def write_trajectory(path: Path, info: TrajectoryInfo, frames: Iterable[Frame]) 
         The number of frames.
 
     Raises:
-        DataError: naming the frame whose shape, pose or cells are wrong, for bad intrinsics, and when there is no
-            frame.
+        DataError: naming the frame that cannot be stored, for a bad camera or source, and when there is no frame.
     """
     check_info(info, str(path))
     frames = iter(frames)
@@ -320,7 +320,7 @@ def _checked_rows(path: Path, info: TrajectoryInfo, frames: Iterable[Frame]) -> 
     box: CellBox | None = None
     for number, frame in enumerate(frames):
         where = f"{path}: frame {number}"
-        _check_frame(frame, info, where)
+        check_frame(frame, info, where)
         now = None if frame.cells is None else CellBox.of(frame.cells)
         if number and now != box:
             raise DataError(f"{where}: its cells are not in the box of those of frame 0")
@@ -349,17 +349,6 @@ def _parquet_errors(path: Path) -> Iterator[None]:
     except (pa.ArrowException, OSError) as error:
         cause = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise DataError(f"{path}: not a whole Parquet file ({cause})") from error
-
-
-def _check_frame(frame: Frame, info: TrajectoryInfo, where: str) -> None:
-    size = (info.height, info.width)
-    rgb, depth, pose = np.asarray(frame.rgb), np.asarray(frame.depth), np.asarray(frame.world_from_camera)
-    if rgb.shape != (*size, 3) or rgb.dtype != np.uint8:
-        raise DataError(f"{where}: rgb is {rgb.dtype} {list(rgb.shape)}, not uint8 {[*size, 3]}")
-    if depth.shape != size or not np.issubdtype(depth.dtype, np.floating):
-        raise DataError(f"{where}: depth is {depth.dtype} {list(depth.shape)}, not floating-point metres {list(size)}")
-    if pose.shape != (4, 4):
-        raise DataError(f"{where}: the pose has shape {list(pose.shape)}, not [4, 4]")
 
 
 def _row(frame: Frame) -> dict[str, Any]:

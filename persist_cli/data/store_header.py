@@ -10,12 +10,11 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import torch
 
 from persist_cli.api.actions import ActionVocabulary
-from persist_cli.api.cameras import check_intrinsics
 from persist_cli.api.cells import CellGrid
 from persist_cli.api.observations import TrajectoryInfo
+from persist_cli.data.storable import check_info
 from persist_cli.data.stored_cells import CellBox
 from persist_cli.errors import DataError
 
@@ -84,23 +83,6 @@ def read_info(metadata: dict[bytes, bytes] | None, path: Path) -> TrajectoryInfo
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"{path}: its header is damaged ({type(error).__name__}: {error})") from error
     return info
-
-
-def check_info(info: TrajectoryInfo, where: str) -> None:
-    """Raise ``DataError`` naming ``where`` unless size, intrinsics and up axis can be used."""
-    if info.height < 1 or info.width < 1:
-        raise DataError(f"{where}: an image size of {info.height}×{info.width} is none")
-    intrinsics = np.asarray(info.intrinsics, dtype=np.float64)
-    if intrinsics.shape != (3, 3):
-        raise DataError(f"{where}: the intrinsics have shape {list(intrinsics.shape)}, not [3, 3]")
-    check_intrinsics(torch.from_numpy(intrinsics), where)
-    up = np.asarray(info.world_up, dtype=np.float64)
-    if up.shape != (3,) or not abs(float(np.linalg.norm(up)) - 1) < 1e-3:
-        raise DataError(f"{where}: world_up {list(info.world_up)} is not a unit vector of three numbers")
-    try:
-        json.dumps(info.source)
-    except TypeError as error:
-        raise DataError(f"{where}: its source must hold values of JSON ({error})") from error
 
 
 def _header_checksum(header: dict[str, Any]) -> str:

@@ -27,10 +27,12 @@ import numpy as np
 
 from persist_cli.api.observations import Frame, TrajectoryInfo
 from persist_cli.api.simulator import Simulator, random_ground
+from persist_cli.data.storable import faults_of, shown
 from persist_cli.data.store import write_trajectory
 from persist_cli.errors import DataError
 from persist_cli.io.files import read_json, remove_leftovers, write_json
-from persist_cli.plugins import check_simulator, make_settings, make_simulator, plugin_errors
+from persist_cli.plugins import check_simulator, load_plugin, make_settings, make_simulator, plugin_errors
+from persist_cli.simulators.answers import check_agent, check_scene
 from persist_cli.simulators.free_grid import clear_distance
 from persist_cli.simulators.policies import POLICIES, walk
 from persist_cli.simulators.ranges import Range
@@ -115,8 +117,21 @@ class CollectPlan:
             wanted = Range.parse(f"--{name}", getattr(self, name))
             if not low <= wanted.low <= wanted.high <= high:
                 raise DataError(f"--{name} {getattr(self, name)!r}: it must lie between {low:g} and {high:g}")
+        self._check_agent_options()
         for end in (attrgetter("low"), attrgetter("high")):  # what the simulator allows at both it allows between them
             make_settings("simulator", self.simulator, self.agent_settings(end))
+
+    def _check_agent_options(self) -> None:
+        """Raise ``DataError`` for the first option that the simulator has no setting for."""
+        settings_type = load_plugin("simulator", self.simulator).settings_type
+        known = [field.name for field in dataclasses.fields(settings_type) if field.init]
+        options = {"height": "size", "width": "size"} | {setting: name for name, setting in AGENT_OPTIONS.items()}
+        for setting in self.agent_settings(attrgetter("low")):
+            if setting not in known:
+                raise DataError(
+                    f"simulator {self.simulator!r} has no --{options[setting]}: there is no {setting!r} among its "
+                    f"settings ({', '.join(known) or 'it has none'})"
+                )
 
     def agent_settings(self, value: Callable[[Range], float]) -> dict[str, Any]:
         """Settings of the simulator, each range by the value that ``value`` gives of it.
@@ -240,7 +255,11 @@ def scene_simulator(plan: CollectPlan, seed: int, last: Simulator | None) -> Sim
     if last is None:
         return make_simulator(plan.simulator, values)
     settings = make_settings("simulator", plan.simulator, values)
-    return last if settings == last.settings else last.with_settings(settings)
+    simulator = last if settings == last.settings else last.with_settings(settings)
+    with faults_of("simulator", last.name):
+        if not isinstance(simulator, Simulator):
+            raise DataError(f"with_settings() returned {shown(simulator)}, no Simulator")
+    return simulator
 
 
 def scene_look(plan: CollectPlan, seed: int) -> Look:
@@ -280,10 +299,13 @@ def collect_frames(simulator: Simulator, plan: CollectPlan, seed: int) -> Iterat
 
     Raises:
         DataError: when the scene has no free place for the agent.
+        PluginError: when the simulator gives a wrong answer.
     """
     random = np.random.default_rng([plan.seed, seed])
     simulator.open_scene(seed)
+    check_scene(simulator)
     simulator.place(random_start(simulator, random), float(random.uniform(-math.pi, math.pi)))
+    check_agent(simulator)
     return walk(simulator, POLICIES[plan.policy], random, plan.frames)
 
 

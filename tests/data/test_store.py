@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
+from persist_cli.api.actions import Action, ActionVocabulary
 from persist_cli.data.store import Store, TrajectoryFile, write_trajectory
 from persist_cli.errors import DataError
 from persist_cli.io.files import ASIDE
@@ -136,13 +137,17 @@ def test_frames_outside_a_trajectory_are_refused(path: Path, frames: slice | lis
         ({"world_from_camera": np.full((4, 4), np.nan)}, "the pose of frame 3 is not finite"),
         ({"world_from_camera": np.diag([2.0, 2, 2, 1])}, "the pose of frame 3 is not rigid"),
         ({"world_from_camera": np.diag([1.0, 1, -1, 1])}, "the pose of frame 3 is not rigid"),
+        ({"world_from_camera": np.eye(4, dtype=complex)}, r"frame 3: the pose has shape \[4, 4\] of complex128"),
+        ({"rgb": torch.zeros(16, 24, 3)}, r"frame 3: rgb is tensor\(\[\[\[0\., 0\., 0\..*…, no array of numpy"),
+        ({"action": 3}, "frame 3: its action is 3, not a name"),
+        ({"timestamp": None}, "frame 3: its timestamp is None, not a finite number"),
+        ({"timestamp": np.nan}, "frame 3: its timestamp is nan"),
+        ({"cells": "walls"}, "frame 3: its cells are 'walls', no CellGrid"),
     ],
 )
-def test_a_wrong_frame_is_named_and_nothing_is_written(
-    tmp_path: Path, change: dict[str, np.ndarray], cause: str
-) -> None:
+def test_a_wrong_frame_is_named_and_nothing_is_written(tmp_path: Path, change: dict[str, object], cause: str) -> None:
     frames = make_frames(5)
-    frames[3] = replace(frames[3], **change)
+    frames[3] = replace(frames[3], **change)  # type: ignore[arg-type]
     with pytest.raises(DataError, match=cause):
         write_trajectory(tmp_path / "one.parquet", INFO, frames)
     assert not list(tmp_path.iterdir())
@@ -158,12 +163,22 @@ def test_a_wrong_frame_is_named_and_nothing_is_written(
         ({"intrinsics": np.array([[1.0, 1, 0], [1, 1, 0], [0, 0, 1]])}, "not a pinhole matrix$"),
         ({"source": {"fps": np.float32(30)}}, "its source must hold values of JSON"),
         ({"world_up": (0.0, 0.0, 0.0)}, "unit vector"),
-        ({"height": 0}, "image size"),
+        ({"height": 0}, "image size of 0×24 is none"),
+        ({"height": None}, r"image size of \(None, 24\) is not two whole numbers"),
+        ({"height": 16.0}, r"image size of \(16\.0, 24\) is not two whole numbers"),
+        ({"scene": None}, "its scene is None, not a name"),
+        ({"intrinsics": "wide"}, "the intrinsics are 'wide', no matrix of numbers"),
+        ({"world_up": None}, "world_up None is not a unit vector"),
+        ({"source": None}, "its source is None, not a dictionary"),
+        ({"vocabulary": ["free"]}, r"its vocabulary is \['free'\], no ActionVocabulary"),
+        ({"vocabulary": ActionVocabulary((Action("go", forward=np.nan),))}, "'go' has forward nan and turn 0"),
+        ({"vocabulary": ActionVocabulary((Action("go"), Action("go")))}, "two actions of one name"),
     ],
 )
 def test_a_wrong_camera_is_refused(tmp_path: Path, change: dict[str, object], cause: str) -> None:
-    with pytest.raises(DataError, match=cause):
-        write_trajectory(tmp_path / "one.parquet", replace(INFO, **change), make_frames(2))
+    with pytest.raises(DataError, match=cause) as error:
+        write_trajectory(tmp_path / "one.parquet", replace(INFO, **change), make_frames(2))  # type: ignore[arg-type]
+    assert "\n" not in str(error.value)
 
 
 def test_a_camera_may_have_values_of_numpy(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""``persist inspect``: what a data set holds, and whether its cameras, depth and poses agree."""
+"""``persist inspect``: what a data set holds, and whether its cameras, depth, poses and actions agree."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from persist_cli.data.check.convention import (
     check_convention,
     hypotheses,
 )
+from persist_cli.data.check.motions import wrong_motions
 from persist_cli.data.check.others import describe_other
 from persist_cli.data.check.reprojection import choose_pairs
 from persist_cli.data.reference import Reference, parse_reference
@@ -73,10 +74,11 @@ def run_inspect(data: str, pairs: int, json: bool) -> None:
     reference = parse_reference(data)
     files = reference.trajectories()
     figures, check = _inspect(files, reference, pairs)
-    actions = action_effects(files)
+    actions, motions = action_effects(files), wrong_motions(files, reference.frames)
     if json:
         trajectories = [asdict(one) for one in figures]
-        print_json({"data": data, "actions": actions, "trajectories": trajectories, "check": asdict(check)})
+        values = {"data": data, "actions": actions, "wrong_motions": motions, "trajectories": trajectories}
+        print_json(values | {"check": asdict(check)})
     else:
         print_table(data, ("holds", ""), figures_table(figures, actions))
         print_table(f"convention check, {check.pairs} frame pairs", ("reprojected", ""), check_table(check))
@@ -84,7 +86,9 @@ def run_inspect(data: str, pairs: int, json: bool) -> None:
     broken = [one for one in figures if one.unknown_actions]
     for one in broken:
         warn(unknown_actions_line(one))
-    if check.verdict == SUSPICIOUS or broken:
+    for line in motions:
+        warn(f"wrong: {line}")
+    if check.verdict == SUSPICIOUS or broken or motions:
         raise typer.Exit(1)
 
 

@@ -13,12 +13,14 @@ from persist_cli.api.importer import ForeignTrajectory, Importer
 from persist_cli.api.observations import Frame, TrajectoryInfo
 from persist_cli.data.held_out import HELD_OUT_FROM, ONLY_BEFORE
 from persist_cli.data.images import CropResize, crop_resize, parse_size
+from persist_cli.data.importers.checking import checked_trajectories
+from persist_cli.data.storable import faults_of
 from persist_cli.data.store import SUFFIX, TrajectoryFile, write_trajectory
 from persist_cli.data.store_header import schema
-from persist_cli.errors import DataError, PluginError
+from persist_cli.errors import DataError
 from persist_cli.io.command_line import quoted
 from persist_cli.io.files import remove_leftovers
-from persist_cli.plugins import find_plugin, make_importer
+from persist_cli.plugins import make_importer
 from persist_cli.viewing.console import add_task, print_json, print_table, progress, say
 
 MOST_CAUSES = 3  # that are printed for a trajectory
@@ -117,6 +119,8 @@ class ImportPlan:
                 gap = True
                 continue
             if kept == most:
+                for _ in trajectory.frames:  # held-out ones: that they are as many as was said is checked with them
+                    pass
                 break
             kept += 1
             if last is not None:
@@ -182,7 +186,8 @@ def run_import(format: str, source: Path, out: Path, plan: ImportPlan, json: boo
         json: print JSON instead of a table.
 
     Raises:
-        PersistError: for an unknown format, a source that cannot be read, or a trajectory of other settings in ``out``.
+        PersistError: for an unknown format or a broken importer, a source that cannot be read, or a trajectory of other
+            settings in ``out``.
     """
     importer = make_importer(format)
     if not source.exists():
@@ -191,11 +196,11 @@ def run_import(format: str, source: Path, out: Path, plan: ImportPlan, json: boo
         raise DataError(f"--hold-out {plan.hold_out:g}: give a share of the frames, 0 or more and below 1, as in 0.3")
     usable: dict[str, int] = {}
     if plan.hold_out and plan.skip_bad:  # the share that is held out is one of the usable frames
-        usable = {trajectory.name: plan.count_usable(trajectory) for trajectory in importer.trajectories(source)}
+        usable = {one.name: plan.count_usable(one) for one in checked_trajectories(importer, source)}
     rows = [
         import_trajectory(importer, trajectory, replace(part, usable=usable.get(trajectory.name)), folder)
         for part, folder in plan.parts(out)
-        for trajectory in importer.trajectories(source)
+        for trajectory in checked_trajectories(importer, source)
     ]
     if json:
         print_json({"out": str(out), "trajectories": rows})
@@ -241,11 +246,11 @@ def _checked(frames: Iterator[Frame], info: TrajectoryInfo, importer: Importer) 
     """Yield the frames; ``PluginError`` naming the importer for an action that is not in the vocabulary."""
     for number, frame in enumerate(frames):
         if frame.action is not None and frame.action not in info.vocabulary.names:
-            plugin = find_plugin("importer", importer.name)
-            raise PluginError(
-                f"{plugin} is broken: frame {number} takes the action {frame.action!r}, which its vocabulary "
-                f"({', '.join(info.vocabulary.names)}) does not have"
-            )
+            with faults_of("importer", importer.name):
+                raise DataError(
+                    f"frame {number} takes the action {frame.action!r}, which its vocabulary "
+                    f"({', '.join(info.vocabulary.names)}) does not have"
+                )
         yield frame
 
 

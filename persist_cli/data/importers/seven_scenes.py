@@ -17,9 +17,10 @@ import numpy as np
 import torch
 
 from persist_cli.api.actions import FREE, free_motion
-from persist_cli.api.cameras import check_intrinsics, check_poses
+from persist_cli.api.cameras import check_intrinsics, check_pose
 from persist_cli.api.importer import ForeignTrajectory, Importer
 from persist_cli.api.observations import Frame, TrajectoryInfo
+from persist_cli.data.importers.checking import FIT_NAME, is_fit_name
 from persist_cli.data.importers.gravity import Array, Direction, estimate_up, level_up
 from persist_cli.data.importers.readers import read_color, read_depth, read_matrix
 from persist_cli.errors import DataError
@@ -74,6 +75,9 @@ class SevenScenes(Importer):
 def _sequence(folder: Path) -> ForeignTrajectory:
     is_part = bool(SEQUENCE.match(folder.name))
     scene = folder.parent.name if is_part else folder.name
+    name = f"{scene}-{folder.name}" if is_part else scene
+    if not is_fit_name(name):
+        raise DataError(f"{folder}: rename the folder, since its trajectory cannot be named {name!r}; {FIT_NAME}")
     files = _frame_files(folder)
     intrinsics = _intrinsics(folder)
     poses = [_pose(frame) for frame in files]
@@ -89,7 +93,6 @@ def _sequence(folder: Path) -> ForeignTrajectory:
         vocabulary=free_motion(),
         source={"format": "7scenes", "folder": folder.name, "world_up": "estimated from cameras and level surfaces"},
     )
-    name = f"{scene}-{folder.name}" if is_part else scene
     return ForeignTrajectory(name, info, _frames(files, poses, info), len(files))
 
 
@@ -134,9 +137,9 @@ def _pose(frame: FrameFiles) -> Array | DataError:
     """The frame's pose, or the error that names its file and why the pose cannot be used."""
     try:
         pose = read_matrix(frame.pose, 4, 4)
-        check_poses(torch.from_numpy(pose)[None], str(frame.pose))
+        check_pose(torch.from_numpy(pose), str(frame.pose))
     except DataError as error:
-        return DataError(str(error).replace("the pose of frame 0", "the pose"))
+        return error
     return pose
 
 

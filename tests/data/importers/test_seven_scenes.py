@@ -118,6 +118,13 @@ def test_a_folder_without_frames_is_refused(tmp_path: Path) -> None:
         run_import("7scenes", tmp_path / "nowhere", tmp_path / "out", ImportPlan(), False)
 
 
+@pytest.mark.parametrize("name", ["2026-05-01 10:15", "kitchen#2", ".kitchen"])
+def test_a_folder_whose_name_no_trajectory_can_have_is_to_be_renamed(tmp_path: Path, name: str) -> None:
+    write_sequence(tmp_path / name, 2)
+    with pytest.raises(DataError, match=f"{re.escape(name)}: rename the folder, since its trajectory cannot be named"):
+        run_import("7scenes", tmp_path / name, tmp_path / "out", ImportPlan(), False)
+
+
 def test_an_unknown_format_gets_a_hint(tmp_path: Path) -> None:
     with pytest.raises(PluginError, match="did you mean '7scenes'"):
         run_import("7scene", tmp_path, tmp_path / "out", ImportPlan(), False)
