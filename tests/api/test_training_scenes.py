@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
+
 from persist_cli.api.training_scenes import TrainingScenes, name_ranges
 
 HOUSES = [f"miniworld/house-{number}" for number in range(2400)]

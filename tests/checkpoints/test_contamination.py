@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from persist_cli.api.training_scenes import TrainingScenes
 
 from persist_cli.api.checkpoint import find_checkpoint
+from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.checkpoints.contamination import (
     ShownScene,
     known_names,

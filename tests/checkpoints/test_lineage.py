@@ -6,9 +6,9 @@ import json
 import shutil
 
 import pytest
-from persist_cli.api.training_scenes import TrainingScenes
 
 from persist_cli.api.checkpoint import find_checkpoint
+from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.checkpoints.contamination import scenes_to_avoid
 from persist_cli.checkpoints.lineage import chosen_on, stage_recipes, training_scenes
 from persist_cli.checkpoints.scene_models import find_scene_model, write_scene_card

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from persist_cli.api.training_scenes import TrainingScenes
 
+from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.data.cameras import unfamiliar_view, vertical_view
 from tests.support.rooms import Room
 

@@ -11,10 +11,10 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from persist_cli.api.training_scenes import TrainingScenes
 
 from persist_cli.api.checkpoint import CARD, find_checkpoint
 from persist_cli.api.observations import Frame
+from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.data.store import Store, write_trajectory
 from persist_cli.episodes.episodes import EpisodeSet
 from persist_cli.episodes.find_episodes import EpisodeSearch, find_episodes

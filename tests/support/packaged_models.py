@@ -7,7 +7,6 @@ from hashlib import sha256
 from pathlib import Path
 
 from persist_cli.api.training_scenes import TrainingScenes
-
 from persist_cli.data.reference import parse_reference
 
 

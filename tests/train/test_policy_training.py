@@ -6,9 +6,9 @@ import json
 import shutil
 
 import pytest
-from persist_cli.api.training_scenes import TrainingScenes
 
 from persist_cli.api.checkpoint import step_folders
+from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.io.files import read_tensors
 from persist_cli.policies.trained import find_policy
 from persist_cli.recipe import make_recipe, read_recipe

@@ -19,11 +19,12 @@ from persist_cli.data.store import SUFFIX, TrajectoryFile, write_trajectory
 from persist_cli.data.store_header import schema
 from persist_cli.errors import DataError
 from persist_cli.io.command_line import quoted
-from persist_cli.io.files import remove_leftovers
+from persist_cli.io.files import check_folder, remove_leftovers
 from persist_cli.plugins import make_importer
 from persist_cli.viewing.console import add_task, print_json, print_table, progress, say
 
 MOST_CAUSES = 3  # that are printed for a trajectory
+ABANDONED = 600.0  # seconds without a change after which what an import wrote is no longer being written
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,10 +63,13 @@ class ImportPlan:
         )  # fmt: skip
 
     def parts(self, out: Path) -> list[tuple[ImportPlan, Path]]:
-        """What is written and where: all into ``out``, or with frames held out a training and a test part into it."""
+        """What is written and where: all into ``out``, or with frames held out a test and a training part into it.
+
+        The test part comes first: it is read to the end, so that nothing is written where a frame is bad.
+        """
         if not self.hold_out:
             return [(self, out)]
-        return [(replace(self, part=part), out / part) for part in ("train", "test")]
+        return [(replace(self, part=part), out / part) for part in ("test", "train")]
 
     def first_held_out(self, trajectory: ForeignTrajectory) -> int:
         """Number of the first kept frame that is held out.
@@ -190,6 +194,7 @@ def run_import(format: str, source: Path, out: Path, plan: ImportPlan, json: boo
             settings in ``out``.
     """
     importer = make_importer(format)
+    check_folder(out)
     if not source.exists():
         raise DataError(f"{source}: no such file or folder")
     if not 0 <= plan.hold_out < 1:
@@ -197,11 +202,14 @@ def run_import(format: str, source: Path, out: Path, plan: ImportPlan, json: boo
     usable: dict[str, int] = {}
     if plan.hold_out and plan.skip_bad:  # the share that is held out is one of the usable frames
         usable = {one.name: plan.count_usable(one) for one in checked_trajectories(importer, source)}
-    rows = [
-        import_trajectory(importer, trajectory, replace(part, usable=usable.get(trajectory.name)), folder)
+    written = [
+        [
+            import_trajectory(importer, trajectory, replace(part, usable=usable.get(trajectory.name)), folder)
+            for trajectory in checked_trajectories(importer, source)
+        ]
         for part, folder in plan.parts(out)
-        for trajectory in checked_trajectories(importer, source)
     ]
+    rows = [row for part in reversed(written) for row in part]
     if json:
         print_json({"out": str(out), "trajectories": rows})
         return
@@ -215,7 +223,7 @@ def run_import(format: str, source: Path, out: Path, plan: ImportPlan, json: boo
         if row["causes"]:
             rest = row["left_out"] - len(row["causes"])
             say(f"left out of {row['name']}: {'; '.join(row['causes'])}{f'; and {rest} more' if rest else ''}")
-    say(f"next: persist inspect {quoted(plan.parts(out)[-1][1])}")
+    say(f"next: persist inspect {quoted(plan.parts(out)[0][1])}")
 
 
 def import_trajectory(importer: Importer, trajectory: ForeignTrajectory, plan: ImportPlan, out: Path) -> dict[str, Any]:
@@ -261,13 +269,18 @@ def _is_imported(path: Path, info: TrajectoryInfo, plan: ImportPlan, trajectory:
     file = TrajectoryFile(path)
     most = plan.written(trajectory)
     length_fits = 0 < file.length <= most if plan.skip_bad else file.length == most
-    if not length_fits or schema(file.info).metadata != schema(info).metadata:
+    infos = [info]
+    if plan.skip_bad and file.length == most:  # nothing was left out, so that it may have been written without
+        kept = replace(plan, skip_bad=False)
+        whole = kept.info(trajectory.info)
+        infos.append(replace(whole, source=whole.source | kept.source(trajectory)))
+    if not length_fits or schema(file.info).metadata not in [schema(one).metadata for one in infos]:
         raise DataError(f"{path}: holds another trajectory or one of other settings; remove it or take another --out")
     return True
 
 
 def _write(path: Path, info: TrajectoryInfo, length: int, frames: Iterator[Frame]) -> None:
-    remove_leftovers(path.parent, path.name)
+    remove_leftovers(path.parent, path.name, age=ABANDONED)
     with progress() as bar:
         task = add_task(bar, path.name.removesuffix(SUFFIX), length, "frames")
 

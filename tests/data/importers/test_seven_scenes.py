@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
+import time
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +14,10 @@ import pytest
 import torch
 from PIL import Image
 
-from persist_cli.data.importers.importing import ImportPlan, run_import
+from persist_cli.data.importers.importing import ABANDONED, ImportPlan, run_import
 from persist_cli.data.importers.seven_scenes import SevenScenes
 from persist_cli.data.store import Store
-from persist_cli.errors import DataError, PluginError
+from persist_cli.errors import DataError, PersistError, PluginError
 from persist_cli.io.files import ASIDE
 from tests.support.rooms import Room, walk, write_sequence
 
@@ -259,12 +261,32 @@ def test_frames_are_in_the_order_of_their_numbers_with_or_without_leading_zeros(
 
 
 def test_an_import_leaves_alone_what_another_one_is_writing(tmp_path: Path) -> None:
-    own, others = (tmp_path / "out" / f"{ASIDE}0a1b2c3d-{name}.parquet" for name in ("kitchen", "red-kitchen"))
-    own.parent.mkdir()
-    for path in (own, others):
+    killed, writing, others = (
+        tmp_path / "out" / f"{ASIDE}{name}.parquet" for name in ("0a1b-kitchen", "2c3d-kitchen", "4e5f-red-kitchen")
+    )
+    killed.parent.mkdir()
+    for path in (killed, writing, others):
         path.touch()
+    os.utime(killed, (0, time.time() - 2 * ABANDONED))
     run_import("7scenes", write_sequence(tmp_path / "kitchen", 2), tmp_path / "out", ImportPlan(), False)
-    assert (own.exists(), others.exists()) == (False, True)
+    assert (killed.exists(), writing.exists(), others.exists()) == (False, True, True)
+
+
+def test_a_bad_frame_among_those_held_out_leaves_nothing_and_can_then_be_left_out(tmp_path: Path) -> None:
+    whole, bad = (write_sequence(tmp_path / "lab" / name, 10) for name in ("seq-01", "seq-02"))
+    sorted(bad.glob("*.pose.txt"))[8].write_text(LOST)
+    with pytest.raises(DataError, match="--skip-bad leaves such frames out"):
+        run_import("7scenes", whole.parent, tmp_path / "out", ImportPlan(hold_out=0.3), False)
+    assert [path.parent.name for path in sorted((tmp_path / "out").rglob("*.parquet"))] == ["test"]  # of seq-01
+    run_import("7scenes", whole.parent, tmp_path / "out", ImportPlan(hold_out=0.3, skip_bad=True), False)
+    lengths = [len(file) for part in ("train", "test") for file in Store(tmp_path / "out" / part)]
+    assert lengths == [7, 6, 10, 9]
+
+
+def test_an_out_that_is_a_file_is_refused_before_anything_is_read(tmp_path: Path) -> None:
+    (tmp_path / "out").touch()
+    with pytest.raises(PersistError, match=r"no folder can be made there, .*out is a file"):
+        run_import("7scenes", tmp_path / "kitchen", tmp_path / "out", ImportPlan(), False)
 
 
 @pytest.mark.parametrize(("share", "cause"), [(1.0, "--hold-out 1: give a share"), (0.01, "leaves a part empty")])
