@@ -125,9 +125,8 @@ def collect(
     from persist_cli.simulators.collect import CollectPlan, run_collect
 
     plan = CollectPlan(
-        simulator=simulator, scenes=scenes, frames=frames, size=size, seed=seed, split=split,
-        policy=policy, step=step, turn=turn, fov=fov, height=height, pitch=pitch,
-        light=light, tint=tint, depth_sensor=depth_sensor,
+        simulator=simulator, scenes=scenes, frames=frames, size=size, seed=seed, split=split, policy=policy,
+        step=step, turn=turn, fov=fov, height=height, pitch=pitch, light=light, tint=tint, depth_sensor=depth_sensor,
     )  # fmt: skip
     run_collect(plan, out, workers, json)
 
@@ -143,6 +142,7 @@ def import_(
     turn: StoredTurnOption = None,
     skip_bad: SkipBadOption = False,
     hold_out: HoldOutOption = 0.0,
+    up: Annotated[str | None, typer.Option(help="Where up is in the poses' world: 0,0,1; else estimated.")] = None,
     json: JsonOption = False,
 ) -> None:
     """Import posed RGB-D of another format.
@@ -153,7 +153,7 @@ def import_(
     """
     from persist_cli.data.importers.importing import ImportPlan, run_import
 
-    run_import(format, source, out, ImportPlan.of(size, every, step, turn, skip_bad, hold_out), json)
+    run_import(format, source, out, ImportPlan.of(size, every, step, turn, skip_bad, hold_out).with_up(up), json)
 
 
 @app.command()

@@ -13,13 +13,14 @@ from persist_cli.api.importer import ForeignTrajectory, Importer
 from persist_cli.api.observations import Frame, TrajectoryInfo
 from persist_cli.data.held_out import HELD_OUT_FROM, ONLY_BEFORE
 from persist_cli.data.images import CropResize, crop_resize, parse_size
+from persist_cli.data.importers.gravity import FROM_CAMERAS, GIVEN, Direction, parse_up, up_text
 from persist_cli.data.store import SUFFIX, TrajectoryFile, write_trajectory
 from persist_cli.data.store_header import schema
 from persist_cli.errors import DataError, PluginError
 from persist_cli.io.command_line import quoted
 from persist_cli.io.files import remove_leftovers
 from persist_cli.plugins import find_plugin, make_importer
-from persist_cli.viewing.console import add_task, print_json, print_table, progress, say
+from persist_cli.viewing.console import add_task, print_json, print_table, progress, say, warn
 
 MOST_CAUSES = 3  # that are printed for a trajectory
 
@@ -36,6 +37,7 @@ class ImportPlan:
         skip_bad: leave out frames that cannot be used.
         hold_out: share of the frames at the end of each trajectory that are kept for tests; 0 for none.
         part: ``train`` for the frames before those, ``test`` for all, of which those at the end are held out.
+        up: unit vector that points up in the world, ``None`` for the one of the importer.
         usable: number of the kept frames of the trajectory that can be used, where that was counted: where frames are
             held out and bad ones left out.
     """
@@ -47,6 +49,7 @@ class ImportPlan:
     skip_bad: bool = False
     hold_out: float = 0.0
     part: str = ""
+    up: Direction | None = None
     usable: int | None = None
 
     @staticmethod
@@ -55,6 +58,14 @@ class ImportPlan:
     ) -> ImportPlan:
         """Return the plan of the command's options; ``size`` is ``HEIGHTxWIDTH`` in pixels."""
         return ImportPlan(parse_size(size) if size else None, every, step, turn, skip_bad, hold_out)
+
+    def with_up(self, text: str | None) -> ImportPlan:
+        """Return this plan with an up axis in text form, as in ``"0,0,1"``.
+
+        Raises:
+            DataError: when it cannot be read.
+        """
+        return self if text is None else replace(self, up=parse_up(text))
 
     def parts(self, out: Path) -> list[tuple[ImportPlan, Path]]:
         """What is written and where: all into ``out``, or with frames held out a training and a test part into it."""
@@ -84,6 +95,8 @@ class ImportPlan:
     def info(self, info: TrajectoryInfo) -> TrajectoryInfo:
         """The info of the imported trajectory."""
         info = replace(info, vocabulary=self._vocabulary(info.vocabulary))
+        if self.up is not None:
+            info = replace(info, world_up=self.up, source={**info.source, "world_up": GIVEN})
         if self.every > 1:
             info = replace(info, source={**info.source, "every": self.every})
         if self.skip_bad:
@@ -194,20 +207,28 @@ def run_import(format: str, source: Path, out: Path, plan: ImportPlan, json: boo
         for part, folder in plan.parts(out)
         for trajectory in importer.trajectories(source)
     ]
+    unsure = [row["name"] for row in rows if row["world_up_is"] == FROM_CAMERAS]
+    if unsure:
+        warn(
+            f"no level surface was found in {', '.join(unsure)}: up is only guessed from how people hold cameras; "
+            "if it is wrong, give --up X,Y,Z and a new --out"
+        )
     if json:
         print_json({"out": str(out), "trajectories": rows})
         return
-    columns = ("trajectory", "frames", "left out", "size", "state")
-    table = [
-        (row["name"], str(row["frames"]), str(row["left_out"]), f"{row['height']}×{row['width']}", row["state"])
-        for row in rows
-    ]
-    print_table(str(out), columns, table)
+    columns = ("trajectory", "frames", "left out", "size", "up", "state")
+    print_table(str(out), columns, [_cells(row) for row in rows])
     for row in rows:
         if row["causes"]:
             rest = row["left_out"] - len(row["causes"])
             say(f"left out of {row['name']}: {'; '.join(row['causes'])}{f'; and {rest} more' if rest else ''}")
     say(f"next: persist inspect {quoted(plan.parts(out)[-1][1])}")
+
+
+def _cells(row: dict[str, Any]) -> tuple[str, ...]:
+    """What the table shows of an imported trajectory."""
+    size, up = f"{row['height']}×{row['width']}", up_text(row["world_up"])
+    return row["name"], str(row["frames"]), str(row["left_out"]), size, up, row["state"]
 
 
 def import_trajectory(importer: Importer, trajectory: ForeignTrajectory, plan: ImportPlan, out: Path) -> dict[str, Any]:
@@ -230,6 +251,8 @@ def import_trajectory(importer: Importer, trajectory: ForeignTrajectory, plan: I
         "causes": [str(cause) for cause in left_out[:MOST_CAUSES]],
         "height": info.height,
         "width": info.width,
+        "world_up": info.world_up,
+        "world_up_is": info.source.get("world_up", "from the importer"),
         "state": state,
     }
 
