@@ -20,6 +20,20 @@ class DataError(PersistError):
     """A data set, trajectory, image or pose cannot be used; the message names the file and the cause."""
 
 
+class FrameError(DataError):
+    """One of several frames cannot be used.
+
+    Args:
+        where: what the message begins with.
+        frame: number of the frame among those that were given.
+        cause: what is wrong with it and what to do.
+    """
+
+    def __init__(self, where: str, frame: int, cause: str) -> None:
+        super().__init__(f"{where}: frame {frame}: {cause}")
+        self.frame, self.cause = frame, cause
+
+
 class PluginError(PersistError):
     """A plugin is unknown, broken or of the wrong kind; the message names plugin, package and cause.
 

@@ -128,9 +128,8 @@ def collect(
     from persist_cli.simulators.collect import CollectPlan, run_collect
 
     plan = CollectPlan(
-        simulator=simulator, scenes=scenes, frames=frames, size=size, seed=seed, split=split,
-        policy=policy, step=step, turn=turn, fov=fov, height=height, pitch=pitch,
-        light=light, tint=tint, depth_sensor=depth_sensor,
+        simulator=simulator, scenes=scenes, frames=frames, size=size, seed=seed, split=split, policy=policy,
+        step=step, turn=turn, fov=fov, height=height, pitch=pitch, light=light, tint=tint, depth_sensor=depth_sensor,
     )  # fmt: skip
     run_collect(plan, out, workers, json)
 
@@ -146,6 +145,7 @@ def import_(
     turn: StoredTurnOption = None,
     skip_bad: SkipBadOption = False,
     hold_out: HoldOutOption = 0.0,
+    up: Annotated[str | None, typer.Option(help="Where up is in the poses' world: 0,0,1; else estimated.")] = None,
     json: JsonOption = False,
 ) -> None:
     """Import posed RGB-D of another format.
@@ -154,9 +154,14 @@ def import_(
 
     persist import 7scenes captures/kitchen --out runs/kitchen --size 64x64
     """
+    from persist_cli.data.images import parse_size
+    from persist_cli.data.importers.gravity import parse_up
     from persist_cli.data.importers.importing import ImportPlan, run_import
 
-    plan = ImportPlan.of(size=size, every=every, step=step, turn=turn, skip_bad=skip_bad, hold_out=hold_out)
+    plan = ImportPlan(
+        size=parse_size(size) if size else None, every=every, step=step, turn=turn, skip_bad=skip_bad,
+        hold_out=hold_out, up=parse_up(up) if up else None,
+    )  # fmt: skip
     run_import(format, source, out, plan, json)
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from persist_cli.api.memory import Memory
 from persist_cli.api.scene import Scene
-from persist_cli.errors import CheckpointError, DataError, PersistError
+from persist_cli.errors import CheckpointError, DataError, FrameError, PersistError
 from persist_cli.io.command_line import quoted
 from persist_cli.io.files import check_folder, remove_leftovers
 from persist_cli.memorize.imagining import of_known_cells, with_scene_model
@@ -127,14 +127,23 @@ def run_merge(paths: list[Path], out: Path, json: bool) -> None:
 
 
 def write_sources(memory: Memory, sources: Sequence[Source]) -> float:
-    """Write all frames into the memory, a few at a time, and return the duration in seconds."""
+    """Write all frames into the memory, a few at a time, and return the duration in seconds.
+
+    Raises:
+        DataError: naming the trajectory and the frame that the memory cannot take.
+    """
     start = time.perf_counter()
     with progress() as bar:
         task = add_task(bar, "memorizing", sum(len(source.frames) for source in sources), "frames")
         for source in sources:
             bar.update(task, note=source.file.name)
+            first = source.frames.start
             for piece in source.pieces():
-                memory.memorize(piece)
+                try:
+                    memory.memorize(piece)
+                except FrameError as error:
+                    raise DataError(f"{source.file.path}: frame {first + error.frame}: {error.cause}") from error
+                first += len(piece)
                 bar.advance(task, len(piece))
     return time.perf_counter() - start
 

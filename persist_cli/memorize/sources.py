@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from persist_cli.api.memory import FrameOfReference
 from persist_cli.api.observations import Observations
+from persist_cli.data.importers.gravity import up_text
 from persist_cli.data.reference import parse_reference
 from persist_cli.data.store import TrajectoryFile
 from persist_cli.errors import DataError
@@ -66,7 +67,13 @@ def common_reference(sources: Sequence[Source]) -> FrameOfReference:
     first = sources[0].file.info
     for source in sources[1:]:
         info = source.file.info
-        if (info.scene, info.world_up) != (first.scene, first.world_up):
+        if info.scene == first.scene and info.world_up != first.world_up:
+            raise DataError(
+                f"{source.file.path} and {sources[0].file.path} are of one scene, but their up axes differ: "
+                f"({up_text(info.world_up, 5)}) and ({up_text(first.world_up, 5)}); import them again, both with one "
+                "--up X,Y,Z or from one folder"
+            )
+        if info.scene != first.scene:
             raise DataError(
                 f"{source.file.path} is of scene {info.scene!r} and {sources[0].file.path} of {first.scene!r}; "
                 "a memory holds one scene: name one trajectory, as in DATA#0"

@@ -158,8 +158,8 @@ class Stage:
             root, color = _walk_node(number, walk), _walk_color(number, walk)
             centers = walk.cameras.centers.double().numpy()
             if len(walk) > 1:
-                ends = np.stack([centers[:-1], centers[1:]], axis=1)
-                self.scene.add_line_segments(f"{root}/way", ends, color, thickness=0.02)
+                ends, middle = _about_middle(np.stack([centers[:-1], centers[1:]], axis=1))
+                self.scene.add_line_segments(f"{root}/way", ends, color, thickness=0.02, position=middle)
             for frame in np.unique(np.linspace(0, len(walk) - 1, min(FRUSTA, len(walk))).round().astype(int)):
                 self.draw_camera(f"{root}/camera {walk.numbers[frame]}", walk, int(frame), 0.12, color)
 
@@ -197,7 +197,8 @@ class Stage:
         for box in boxes:
             corners = torch.cartesian_prod(*torch.tensor([box.low, box.high]).T.unbind(0)).numpy()
             segments += [corners[list(edge)] for edge in EDGES]
-        self.scene.add_line_segments("/selection", np.stack(segments), SELECTED_COLOR, thickness=0.025)
+        edges, middle = _about_middle(np.stack(segments))
+        self.scene.add_line_segments("/selection", edges, SELECTED_COLOR, thickness=0.025, position=middle)
         return None
 
     def draw_tokens(self, tokens: MemoryTokens | None) -> None:
@@ -211,9 +212,10 @@ class Stage:
                 one = cameras[number : number + 1]
                 self.draw_frustum(f"/reading/{number}", one, tokens.images[number].numpy(), 0.25, TOKEN_COLOR)
             return
+        points, middle = _about_middle(tokens.positions.double().numpy())
         self.scene.add_point_cloud(
-            "/reading/tokens", tokens.positions.numpy(), TOKEN_COLOR, point_size=0.06, point_shape="circle",
-            precision="float32",
+            "/reading/tokens", points, TOKEN_COLOR, point_size=0.06, point_shape="circle", precision="float32",
+            position=middle,
         )  # fmt: skip
 
     def _tree(self, name: str) -> DetailTree:
@@ -237,9 +239,10 @@ class Stage:
         self._remove(node)
         for part in parts:
             width = part.size[0]
+            points, middle = _about_middle(part.centers)
             self.scene.add_point_cloud(
-                f"{node}/{width:g} m", part.centers, painted(part, self._colors(layer)), point_size=width,
-                precision="float32", point_shading="flat",
+                f"{node}/{width:g} m", points, painted(part, self._colors(layer)), point_size=width,
+                precision="float32", point_shading="flat", position=middle,
             )  # fmt: skip
 
     def _draw_seen(self, node: str, walk: DrawnWalk, frame: int) -> None:
@@ -248,7 +251,10 @@ class Stage:
         part = slice(frame, frame + 1)
         seen = Observations(walk.pictures[part], walk.depth[part], walk.cameras[part])
         cells = cells_of_frames(seen, self.subject.world_up)
-        self.scene.add_point_cloud(node, cells.centers, cells.colors, point_size=POINT / 2, precision="float32")
+        points, middle = _about_middle(cells.centers)
+        self.scene.add_point_cloud(
+            node, points, cells.colors, point_size=POINT / 2, precision="float32", position=middle
+        )  # fmt: skip
 
     def _set_first_view(self) -> None:
         """Let a page begin with all in view, from above at an angle."""
@@ -278,6 +284,15 @@ def _walk_color(number: int, walk: DrawnWalk) -> tuple[int, int, int]:
     text = PATH_COLORS[number % len(PATH_COLORS)].removeprefix("#")
     red, green, blue = bytes.fromhex(text)
     return red, green, blue
+
+
+def _about_middle(places: Array) -> tuple[Array, tuple[float, float, float]]:
+    """Return places ``[..., 3]`` less their middle, which viser's 32 bits keep far from the origin too, and that."""
+    if not places.size:
+        return places, (0.0, 0.0, 0.0)
+    points = places.reshape(-1, 3)
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    return places - middle, _triple(middle)
 
 
 def _places(cells: DrawnCells) -> Array:

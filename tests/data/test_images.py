@@ -94,3 +94,19 @@ def test_an_image_that_would_fill_the_memory_is_named(tmp_path: Path) -> None:
     for read in (read_color, read_photo):
         with pytest.raises(DataError, match=r"large.png: not a whole image \(Image size \(900000000 pixels\) exceeds"):
             read(tmp_path / "large.png")
+
+
+@pytest.mark.parametrize("read", [read_color, read_photo])
+def test_a_grey_image_of_16_bits_keeps_its_shades(tmp_path: Path, read) -> None:
+    shades = np.array([[0, 128 * 257, 65535]], np.uint16)
+    for name, kind in (("grey.png", "<u2"), ("grey.tif", ">u2")):
+        Image.fromarray(shades.astype(kind)).save(tmp_path / name)
+        assert read(tmp_path / name)[..., 1].tolist() == [[0, 128, 255]]
+
+
+@pytest.mark.parametrize("read", [read_color, read_photo])
+@pytest.mark.parametrize("kind", [np.float32, np.int32])
+def test_a_colour_image_of_32_bit_numbers_is_refused(tmp_path: Path, read, kind) -> None:
+    Image.fromarray(np.ones((4, 4), kind)).save(tmp_path / "deep.tif")
+    with pytest.raises(DataError, match=r"deep\.tif: a colour image of 32-bit numbers; save it with 8 or 16 bits"):
+        read(tmp_path / "deep.tif")

@@ -107,6 +107,27 @@ def test_the_printed_table_has_cells_bytes_bounds_and_rate(data, tmp_path, capsy
     assert all(word in printed for word in words)
 
 
+def test_a_camera_beyond_the_grid_is_named_by_trajectory_and_frame(tmp_path, capsys):
+    poses = walk(300)
+    poses[280, 0, 3] += 1e6
+    Room(8, 8).write(tmp_path / "far.parquet", poses)
+    line = failure(capsys, f"{tmp_path}#far:5-300", "--out", tmp_path / "far.safetensors")
+    assert "far.parquet: frame 280: its camera lies 1,000 km" in line
+    assert not (tmp_path / "far.safetensors").exists()
+
+
+def test_trajectories_of_one_scene_with_other_up_axes_are_told_apart_from_other_scenes(tmp_path, capsys):
+    room = Room(8, 8)
+    room.write(tmp_path / "a.parquet", walk(2))
+    write_trajectory(tmp_path / "b.parquet", replace(room.info, world_up=(0.0, 0.0, 1.0)), room.frames(walk(2)))
+    line = failure(capsys, tmp_path, "--out", tmp_path / "m.safetensors")
+    assert "their up axes differ: (0.00000, 0.00000, 1.00000) and (0.00000, 1.00000, 0.00000)" in line
+    for name in "ab":
+        memorize(capsys, f"{tmp_path}#{name}", "--out", tmp_path / f"{name}.safetensors")
+    files = [tmp_path / f"{name}.safetensors" for name in "ab"]
+    assert "differ in up axis" in failure(capsys, "--merge", *files, "--out", tmp_path / "m.safetensors")
+
+
 def test_data_that_cannot_be_memorized_is_refused_in_one_line(data, tmp_path, capsys):
     out = ["--out", tmp_path / "room.safetensors"]
     assert "a memory holds one scene" in failure(capsys, data, *out)

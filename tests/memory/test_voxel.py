@@ -5,12 +5,13 @@ import torch
 
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.geometry import project, unproject
+from persist_cli.api.memory import FrameOfReference
 from persist_cli.api.observations import Observations
 from persist_cli.errors import CheckpointError, DataError
-from persist_cli.plugins import make_encoder
+from persist_cli.plugins import make_encoder, make_memory
 from persist_memory.grid.pooling import CENTERED
 from tests.support.room_views import empty_memory, moved, observe, room_walk, same_bits, translation, written_memory
-from tests.support.rooms import look
+from tests.support.rooms import UP, look
 
 SIZE = torch.tensor([0.25, 1.0, 0.25], dtype=torch.float64)
 
@@ -81,6 +82,29 @@ def test_points_beyond_the_grid_are_left_out():
     observations = room_walk(1)
     depth = torch.full_like(observations.depth, 1e9)
     assert written_memory("voxel", replace(observations, depth=depth)).figures().cells == 0
+
+
+def placed(observations: Observations, frame: int, x: float) -> Observations:
+    """The same frames, the camera of one of them so many metres along x."""
+    poses = observations.cameras.world_from_camera.clone()
+    poses[frame, 0, 3] = x
+    return replace(observations, cameras=replace(observations.cameras, world_from_camera=poses))
+
+
+@pytest.mark.parametrize("name", ["voxel", "map2d"])
+def test_a_camera_near_the_rim_of_the_grid_takes_no_pixel_from_the_others(name):
+    observations = room_walk(3)
+    alone = written_memory(name, observations[[0, 2]]).figures().cells
+    rim = placed(observations, 1, 0.25 * ((1 << 20) - 2))
+    assert written_memory(name, rim).figures().cells == alone
+
+
+@pytest.mark.parametrize(("name", "encoder"), [("voxel", "patches"), ("map2d", "patches"), ("scene", "classes")])
+def test_a_camera_beyond_the_grid_is_named_and_nothing_is_written(name, encoder):
+    memory = make_memory(name, {}, make_encoder(encoder, {}), FrameOfReference("room", UP))
+    with pytest.raises(DataError, match=r"frame 2: its camera lies 500 km .* reaches 262 km; move the origin near"):
+        memory.write(placed(room_walk(3), 2, 5e5))
+    assert memory.figures().cells == 0
 
 
 def test_pixels_farther_than_the_greatest_depth_are_left_out():

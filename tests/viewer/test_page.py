@@ -5,12 +5,14 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import viser
 
+from persist_cli.data.store import write_trajectory
 from persist_cli.memorize.memory_file import load_memory
 from persist_cli.viewer.edit_session import EditSession
 from persist_cli.viewer.imagine import Imaginer, ImagineSettings
@@ -18,6 +20,7 @@ from persist_cli.viewer.page import Page
 from persist_cli.viewer.page_server import page_server
 from persist_cli.viewer.stage import Look
 from persist_cli.viewer.subject import MAP, POINTS, TRUTH, open_subject
+from tests.support.rooms import Room, walk
 from tests.support.view_tabs import open_tab, until
 
 
@@ -95,6 +98,22 @@ def test_the_time_goes_on_until_nobody_looks(walks):
         until(lambda: not page.play.value and not page._plays)
 
 
+def test_what_lies_far_from_the_origin_is_drawn_to_a_millimetre(tmp_path):
+    poses, room = walk(3), Room(16, 16)
+    poses[:, :3, 3] += (500_000.0, 100.0, 5_400_000.0)
+    seen = zip(room.frames(walk(3)), poses, strict=True)
+    frames = [replace(frame, world_from_camera=pose) for frame, pose in seen]
+    write_trajectory(tmp_path / "far.parquet", room.info, frames)
+    with page_server("127.0.0.1", 0) as server:
+        page = Page(server, open_subject(str(tmp_path)), Look(layers={POINTS}, form="points"), None, None)
+        (way,) = [name for name in server.scene._handle_from_node_name if name.endswith("/way")]
+        line = server.scene.get_handle_by_name(way)
+        assert np.allclose(line.points[:, 0].astype(float) + line.position, poses[:-1, :3, 3], atol=1e-3, rtol=0)
+        (cells,) = page.stage._tree(POINTS).select(page.look.most)
+        drawn = server.scene.get_handle_by_name(f"/layers/{POINTS}/{cells.size[0]:g} m")
+        assert np.allclose(drawn.points.astype(float) + drawn.position, cells.centers, atol=1e-3, rtol=0)
+
+
 def test_changes_are_shown_in_colours_of_their_own(server, room):
     page = page_of(server, room, 40_000)
     page.session.select_thing("box#1")
@@ -111,7 +130,7 @@ def test_what_a_camera_reads_of_a_map_is_drawn_as_points(server, room):
     page._read(page.present_camera())
     expected = page.session.edited.read(page.present_camera(), 256)
     drawn = server.scene.get_handle_by_name("/reading/tokens")
-    assert np.allclose(drawn.points, expected.positions.numpy(), atol=1e-5)
+    assert np.allclose(drawn.points + drawn.position, expected.positions.numpy(), atol=1e-5)
     assert page._read_text.text.startswith(f"{len(expected)} tokens")
     page.stage.draw_tokens(None)
     assert server.scene.get_handle_by_name("/reading/tokens") is None

@@ -32,7 +32,7 @@ from persist_memory.grid.pooling import (
     unpack_colors,
     unpack_depths,
 )
-from persist_memory.grid.storage import BLOCK, LIMIT, SparseGrid, ValueColumn, pack, unpack
+from persist_memory.grid.storage import BLOCK, LIMIT, SparseGrid, ValueColumn, check_within_grid, pack, unpack
 from persist_memory.grid.visibility import Views, block_distances, nearest_cells, ranges
 from persist_memory.validation import (
     ORIGINS,
@@ -101,9 +101,11 @@ class GridMemory(Memory):
         """Pool the frames' features into the cells of their pixels; pixels without valid depth are left out.
 
         Raises:
-            DataError: when a pose is not finite and rigid; then nothing is written.
+            DataError: when a pose is not finite and rigid, or a camera lies beyond the grid; then nothing is written.
         """
         check_observations(observations, f"memory {self.name!r}")
+        centers = observations.cameras.centers.double().cpu() @ self.lattice.grid_from_world.T
+        check_within_grid(centers, self.lattice.size, f"memory {self.name!r}")
         if not len(observations):
             return
         on_cpu = observations.depth.device.type == "cpu"

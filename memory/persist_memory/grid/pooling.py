@@ -165,13 +165,14 @@ def cell_numbers(
     v = torch.arange(0, cameras.height, stride, device=depth.device)[:, None] + 0.5
     u = torch.arange(0, cameras.width, stride, device=depth.device) + 0.5
     reach = rays.abs() @ rays.new_tensor([cameras.width, cameras.height, 1.0])
-    farthest = float(((LIMIT - 1 - start.abs()) / reach).amin())  # metres that surely stay within the grid
+    farthest = ((LIMIT - 1 - start.abs()) / reach).amin(1)  # metres from each camera that surely stay within the grid
+    farthest = farthest.clamp(max=settings.max_depth or math.inf)
     numbers = torch.zeros(depth.shape, dtype=torch.int64, device=depth.device)
     for axis in (0, 2) if lattice.flat else (0, 1, 2):
         a, b, c = (rays[:, axis, i, None, None] for i in range(3))
         coordinate = (a * u + (b * v + c)).mul_(depth).add_(start[:, axis, None, None]).floor_()
         numbers.add_(coordinate.long() << (AXIS_BITS * axis))
-    valid = (depth > 0) & (depth <= min(settings.max_depth or math.inf, farthest))
+    valid = (depth > 0) & (depth <= farthest[:, None, None])
     return torch.where(valid, numbers, NO_CELL)
 
 

@@ -16,8 +16,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
+
+from persist_cli.errors import FrameError
 
 AXIS_BITS = 21  # of one coordinate
 
@@ -60,6 +62,31 @@ def keys_of_numbers(numbers: Int64[Tensor, " cell"]) -> Int64[Tensor, " cell"]:
         coordinates.append(coordinate)
         numbers = (numbers - coordinate) >> AXIS_BITS
     return pack(*coordinates)
+
+
+def check_within_grid(centers: Float[Tensor, "frame 3"], size: Float[Tensor, " 3"] | float, where: str) -> None:
+    """Check that cameras lie where cells have numbers.
+
+    Args:
+        centers: places of the cameras along the grid's axes, in metres from the world's origin.
+        size: metres of a cell along each axis.
+        where: what the message begins with.
+
+    Raises:
+        FrameError: for the first camera that lies beyond.
+    """
+    edges = torch.as_tensor(size, dtype=torch.float64, device=centers.device).expand(3)
+    beyond = centers.double().abs() >= (LIMIT - 1) * edges
+    if not bool(beyond.any()):
+        return
+    frame, axis = beyond.nonzero()[0].tolist()
+    raise FrameError(
+        where,
+        frame,
+        f"its camera lies {float(centers[frame].double().norm()) / 1000:,.0f} km from the world's origin, the grid "
+        f"reaches {LIMIT * float(edges[axis]) / 1000:,.0f} km; move the origin near the cameras (subtract one place "
+        "from all poses), or leave the frame out if its pose is wrong",
+    )
 
 
 @dataclass(frozen=True)

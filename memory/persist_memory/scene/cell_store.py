@@ -113,7 +113,8 @@ class CellStore:
             metres = " × ".join(f"{side * self.form.size:.0f}" for side in sides)
             raise DataError(
                 f"a scene of {metres} m has {math.prod(sides):,} cells of {self.form.size:g} m, more than "
-                f"{MOST_CELLS:,}; take larger cells (memory.size) or a smaller memory.farthest"
+                f"{MOST_CELLS:,}; leave out frames that lie far from the others, or take larger cells (memory.size) or "
+                "a smaller memory.farthest"
             )
         before = [0] * 3 if empty else [c - a for c, a in zip(self.corner, first, strict=True)]
         after = [b - a - s for b, a, s in zip(sides, before, self.shape, strict=True)]

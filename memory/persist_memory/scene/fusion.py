@@ -136,12 +136,13 @@ def _frame_votes(view: _View, axes: Float[Tensor, "3 3"], size: float, farthest:
     believed = (view.depth > 0) & (view.depth <= farthest)
     inner = view.points[believed] + UNDER * size * view.normals[believed]
     places = inner @ lattice_from_camera.T + origin
-    keys, inverse = torch.unique(pack(*places.round().long().unbind(1)), return_inverse=True)
-    hit = unpack(keys)
+    home = origin.round().long()  # what is packed is counted from there, so that the rim of the grid is no seam
+    keys, inverse = torch.unique(pack(*(places.round().long() - home).unbind(1)), return_inverse=True)
+    hit = unpack(keys) + home
     colors = torch.cat([view.rgb[believed].long(), torch.ones_like(inverse)[:, None]], dim=1)
     sums = torch.zeros(len(hit), 4, dtype=torch.int64, device=hit.device).index_add_(0, inverse, colors)
     passed = _passed(view, lattice_from_camera, origin, size, farthest)
-    return Votes(hit, sums, _without(passed, hit))
+    return Votes(hit, sums, _without(passed, hit, home))
 
 
 def _passed(
@@ -197,8 +198,11 @@ def _cells_in_front(
     return front + low, local[front[:, 0], front[:, 1], front[:, 2]]
 
 
-def _without(cells: Int64[Tensor, "cell 3"], others: Int64[Tensor, "other 3"]) -> Int64[Tensor, "rest 3"]:
-    """Return distinct cells that are not among the others."""
+def _without(
+    cells: Int64[Tensor, "cell 3"], others: Int64[Tensor, "other 3"], home: Int64[Tensor, " 3"]
+) -> Int64[Tensor, "rest 3"]:
+    """Return distinct cells that are not among the others; all lie around the cell ``home``."""
     if not len(others):
         return cells
-    return cells[~torch.isin(pack(*cells.unbind(1)), pack(*others.unbind(1)))]
+    keys, taken = (pack(*(part - home).unbind(1)) for part in (cells, others))
+    return cells[~torch.isin(keys, taken)]

@@ -26,6 +26,7 @@ from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError, DataError
 from persist_memory.batched_reads import distinct_cameras, same_size
 from persist_memory.encoders.classes import Classes
+from persist_memory.grid.storage import check_within_grid
 from persist_memory.scene.cell_store import CellStore, check_cells
 from persist_memory.scene.editing import edit_grid
 from persist_memory.scene.fusion import votes_of
@@ -106,10 +107,12 @@ class GridScene(Scene):
         """Fuse posed depth frames; pixels without depth say nothing.
 
         Raises:
-            DataError: when a pose is not finite and rigid, or the scene would become too large; then nothing is
-                written.
+            DataError: when a pose is not finite and rigid, a camera lies beyond the grid, or the scene would become
+                too large; then nothing is written.
         """
         check_observations(observations, f"memory {self.name!r}")
+        centers = observations.cameras.centers.double().cpu() @ self._axes.T
+        check_within_grid(centers, self.settings.size, f"memory {self.name!r}")
         for origin, frames in observations.by_origin() if len(observations) else ():
             if origin == Origin.IMAGINED and not self.settings.writes_imagined:
                 continue

@@ -23,6 +23,7 @@ from persist_cli.data.check.convention import (
 from persist_cli.data.check.motions import wrong_motions
 from persist_cli.data.check.others import describe_other
 from persist_cli.data.check.reprojection import choose_pairs
+from persist_cli.data.importers.gravity import Direction, up_text
 from persist_cli.data.reference import Reference, parse_reference
 from persist_cli.data.store import TrajectoryFile
 from persist_cli.viewing.console import add_task, print_json, print_table, progress, say, warn
@@ -44,6 +45,8 @@ class TrajectoryFigures:
         actions: how often each is taken.
         unknown_actions: those that are taken, but are not in the trajectory's vocabulary.
         cells: whether it holds the cells of its scene.
+        world_up: unit vector that points up in the world.
+        world_up_is: where that comes from, as far as the source says.
     """
 
     name: str
@@ -57,6 +60,8 @@ class TrajectoryFigures:
     actions: dict[str, int]
     unknown_actions: list[str]
     cells: bool = False
+    world_up: Direction = (0.0, 1.0, 0.0)
+    world_up_is: str = ""
 
 
 def run_inspect(data: str, pairs: int, json: bool) -> None:
@@ -133,6 +138,8 @@ def trajectory_figures(file: TrajectoryFile, frames: slice | None = None) -> Tra
         actions=taken,
         unknown_actions=[name for name in taken if name not in info.vocabulary.names],
         cells=file.has_cells,
+        world_up=info.world_up,
+        world_up_is=str(info.source.get("world_up", "")),
     )
 
 
@@ -155,6 +162,7 @@ def figures_table(figures: Sequence[TrajectoryFigures], effects: Mapping[str, st
         ("frames", _total([one.frames for one in figures], str)),
         ("image size", _distinct([f"{one.size[0]}×{one.size[1]}" for one in figures])),
         ("field of view", _distinct([f"{one.field_of_view:.1f}°" for one in figures])),
+        ("up in the world (x, y, z)", _distinct([_up(one) for one in figures])),
         ("metres travelled", _total([one.metres for one in figures], "{:.2f}".format)),
         ("degrees turned", _total([one.turned for one in figures], "{:.0f}".format)),
         ("seconds", _total([one.seconds for one in figures], "{:.1f}".format)),
@@ -208,6 +216,11 @@ def _inspect(
         tries = len(hypotheses(frames[0].cameras)) * min(len(frames), MOST_TRIED) if frames else 0
         task = add_task(bar, "reprojections", len(frames) + tries, "reprojections")
         return figures, check_convention(frames, partial(bar.advance, task))
+
+
+def _up(figures: TrajectoryFigures) -> str:
+    """The up axis, and where it comes from."""
+    return up_text(figures.world_up) + (f" ({figures.world_up_is})" if figures.world_up_is else "")
 
 
 def _print_other(path: str, other: str, json: bool) -> None:

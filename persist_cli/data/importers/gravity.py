@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from persist_cli.errors import DataError
+
 Array = np.ndarray[Any, Any]
 Direction = tuple[float, float, float]
 
@@ -15,6 +17,31 @@ NEAR_UP = (20, 15, 10, 7, 5, 5, 5)  # degrees from up within which normals count
 LEAST_LEVEL = 0.05  # part of all normals that must be level; the kitchen of 7-Scenes has 0.2 within 5°
 POINTS_DOWN = 60  # of an image, as many rows of points
 SAME_SURFACE = 1.1  # ratio of neighbouring depths above which an edge lies between them
+
+GIVEN = "given"  # what the source of a trajectory says of its up axis
+FROM_SURFACES = "estimated from cameras and level surfaces"
+FROM_CAMERAS = "estimated from cameras alone, no level surface was found"
+
+
+def parse_up(text: str) -> Direction:
+    """The unit vector along three numbers in text form, as ``"0,0,1"``.
+
+    Raises:
+        DataError: when it is not of this form, or has no direction.
+    """
+    try:
+        x, y, z = (float(word) for word in text.split(","))
+    except ValueError as error:
+        raise DataError(f"cannot read the up axis {text!r}; write X,Y,Z, as in 0,0,1 or 0,-1,0") from error
+    length = float(np.linalg.norm((x, y, z)))
+    if not 0 < length < np.inf:
+        raise DataError(f"the up axis {text!r} has no direction; write X,Y,Z, as in 0,0,1 or 0,-1,0")
+    return x / length, y / length, z / length
+
+
+def up_text(up: Direction, digits: int = 2) -> str:
+    """The three numbers of an up axis for people, as in ``0.00, -0.89, -0.46``."""
+    return ", ".join(f"{value + 0.0:.{digits}f}" for value in np.round(up, digits).tolist())
 
 
 def estimate_up(poses: Array) -> Direction:
@@ -38,23 +65,22 @@ def estimate_up(poses: Array) -> Direction:
     return x, y, z
 
 
-def level_up(up: Direction, frames: Sequence[tuple[Array, Array]], matrix: Array) -> Direction:
+def level_up(up: Direction, frames: Sequence[tuple[Array, Array, Array]]) -> Direction | None:
     """Return the common normal of the level surfaces: those whose normals are near ``up``, ever nearer to their mean.
 
-    It is ``up`` again where fewer than ``LEAST_LEVEL`` of the surfaces are level, as in a view of one wall.
+    It is ``None`` where fewer than ``LEAST_LEVEL`` of the surfaces are level, as in a view of one wall.
 
     Args:
         up: unit vector that points up within some 20°.
-        frames: depth in metres, 0 = missing, and world_from_camera of some frames.
-        matrix: intrinsics of all of them.
+        frames: depth in metres, 0 = missing, world_from_camera and intrinsics of some frames.
     """
-    normals = np.concatenate([np.zeros((0, 3)), *(_normals(depth, pose, matrix) for depth, pose in frames)])
+    normals = np.concatenate([np.zeros((0, 3)), *(_normals(*frame) for frame in frames)])
     level = np.array(up)
     for degrees in NEAR_UP:
         cosines = normals @ level
         near = np.abs(cosines) > np.cos(np.radians(degrees))
         if not near.any() or near.mean() < LEAST_LEVEL:
-            return up
+            return None
         total = (normals[near] * np.sign(cosines[near])[:, None]).sum(0)
         level = total / np.linalg.norm(total)
     x, y, z = (float(value) for value in level)

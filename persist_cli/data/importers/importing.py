@@ -12,8 +12,9 @@ from persist_cli.api.actions import FREE, ActionVocabulary, free_motion
 from persist_cli.api.importer import ForeignTrajectory, Importer
 from persist_cli.api.observations import Frame, TrajectoryInfo
 from persist_cli.data.held_out import HELD_OUT_FROM, ONLY_BEFORE
-from persist_cli.data.images import CropResize, crop_resize, parse_size
+from persist_cli.data.images import CropResize, crop_resize
 from persist_cli.data.importers.checking import checked_trajectories
+from persist_cli.data.importers.gravity import FROM_CAMERAS, GIVEN, Direction, up_text
 from persist_cli.data.storable import faults_of
 from persist_cli.data.store import SUFFIX, TrajectoryFile, write_trajectory
 from persist_cli.data.store_header import schema
@@ -21,7 +22,7 @@ from persist_cli.errors import DataError
 from persist_cli.io.command_line import quoted
 from persist_cli.io.files import check_folder, remove_leftovers
 from persist_cli.plugins import make_importer
-from persist_cli.viewing.console import add_task, print_json, print_table, progress, say
+from persist_cli.viewing.console import add_task, print_json, print_table, progress, say, warn
 
 MOST_CAUSES = 3  # that are printed for a trajectory
 ABANDONED = 600.0  # seconds without a change after which what an import wrote is no longer being written
@@ -39,6 +40,7 @@ class ImportPlan:
         skip_bad: leave out frames that cannot be used.
         hold_out: share of the frames at the end of each trajectory that are kept for tests; 0 for none.
         part: ``train`` for the frames before those, ``test`` for all, of which those at the end are held out.
+        up: unit vector that points up in the world, ``None`` for the one of the importer.
         usable: number of the kept frames of the trajectory that can be used, where that was counted: where frames are
             held out and bad ones left out.
     """
@@ -50,17 +52,8 @@ class ImportPlan:
     skip_bad: bool = False
     hold_out: float = 0.0
     part: str = ""
+    up: Direction | None = None
     usable: int | None = None
-
-    @staticmethod
-    def of(
-        *, size: str | None, every: int, step: float | None, turn: float | None, skip_bad: bool, hold_out: float = 0.0
-    ) -> ImportPlan:
-        """Return the plan of the command's options; ``size`` is ``HEIGHTxWIDTH`` in pixels."""
-        return ImportPlan(
-            size=parse_size(size) if size else None, every=every, step=step, turn=turn, skip_bad=skip_bad,
-            hold_out=hold_out,
-        )  # fmt: skip
 
     def parts(self, out: Path) -> list[tuple[ImportPlan, Path]]:
         """What is written and where: all into ``out``, or with frames held out a test and a training part into it.
@@ -93,6 +86,8 @@ class ImportPlan:
     def info(self, info: TrajectoryInfo) -> TrajectoryInfo:
         """The info of the imported trajectory."""
         info = replace(info, vocabulary=self._vocabulary(info.vocabulary))
+        if self.up is not None:
+            info = replace(info, world_up=self.up, source={**info.source, "world_up": GIVEN})
         if self.every > 1:
             info = replace(info, source={**info.source, "every": self.every})
         if self.skip_bad:
@@ -210,20 +205,28 @@ def run_import(format: str, source: Path, out: Path, plan: ImportPlan, json: boo
         for part, folder in plan.parts(out)
     ]
     rows = [row for part in reversed(written) for row in part]
+    unsure = [row["name"] for row in rows if row["world_up_is"] == FROM_CAMERAS]
+    if unsure:
+        warn(
+            f"no level surface was found in {', '.join(unsure)}: up is only guessed from how people hold cameras; "
+            "if it is wrong, give --up X,Y,Z and a new --out"
+        )
     if json:
         print_json({"out": str(out), "trajectories": rows})
         return
-    columns = ("trajectory", "frames", "left out", "size", "state")
-    table = [
-        (row["name"], str(row["frames"]), str(row["left_out"]), f"{row['height']}×{row['width']}", row["state"])
-        for row in rows
-    ]
-    print_table(str(out), columns, table)
+    columns = ("trajectory", "frames", "left out", "size", "up", "state")
+    print_table(str(out), columns, [_cells(row) for row in rows])
     for row in rows:
         if row["causes"]:
             rest = row["left_out"] - len(row["causes"])
             say(f"left out of {row['name']}: {'; '.join(row['causes'])}{f'; and {rest} more' if rest else ''}")
     say(f"next: persist inspect {quoted(plan.parts(out)[0][1])}")
+
+
+def _cells(row: dict[str, Any]) -> tuple[str, ...]:
+    """What the table shows of an imported trajectory."""
+    size, up = f"{row['height']}×{row['width']}", up_text(row["world_up"])
+    return row["name"], str(row["frames"]), str(row["left_out"]), size, up, row["state"]
 
 
 def import_trajectory(importer: Importer, trajectory: ForeignTrajectory, plan: ImportPlan, out: Path) -> dict[str, Any]:
@@ -246,6 +249,8 @@ def import_trajectory(importer: Importer, trajectory: ForeignTrajectory, plan: I
         "causes": [str(cause) for cause in left_out[:MOST_CAUSES]],
         "height": info.height,
         "width": info.width,
+        "world_up": info.world_up,
+        "world_up_is": info.source.get("world_up", "from the importer"),
         "state": state,
     }
 

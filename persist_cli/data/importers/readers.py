@@ -12,12 +12,12 @@ from persist_cli.errors import DataError
 
 
 def read_color(path: Path) -> np.ndarray[Any, Any]:
-    """The uint8 ``[height, width, 3]`` image of a file.
+    """The uint8 ``[height, width, 3]`` image of a file; 16 bits become 8, white stays white.
 
     Raises:
-        DataError: when it is missing, truncated or no image.
+        DataError: when it is missing, truncated, no image, or one of 32-bit numbers, whose white nobody knows.
     """
-    return np.array(_read_image(path).convert("RGB"))
+    return _eight_bits(_read_image(path), path)
 
 
 def read_photo(path: Path) -> np.ndarray[Any, Any]:
@@ -28,9 +28,10 @@ def read_photo(path: Path) -> np.ndarray[Any, Any]:
     """
     image = _read_image(path)
     try:
-        return np.array(ImageOps.exif_transpose(image).convert("RGB"))
+        upright = ImageOps.exif_transpose(image)
     except (OSError, SyntaxError, ValueError) as error:
         raise DataError(f"{path}: its EXIF is damaged ({error}); save the image anew") from error
+    return _eight_bits(upright, path)
 
 
 def read_depth(path: Path, units_per_metre: float, missing: tuple[int, ...] = (0,)) -> np.ndarray[Any, Any]:
@@ -67,6 +68,16 @@ def read_matrix(path: Path, rows: int, columns: int) -> np.ndarray[Any, Any]:
     if numbers.size != rows * columns:
         raise DataError(f"{path}: {numbers.size} numbers, not the {rows}×{columns} of the matrix")
     return numbers.reshape(rows, columns)
+
+
+def _eight_bits(image: Image.Image, path: Path) -> np.ndarray[Any, Any]:
+    """The RGB of an image; Pillow itself would make white of every grey value of 16 bits above 255."""
+    if image.mode in ("I", "F"):
+        raise DataError(f"{path}: a colour image of 32-bit numbers; save it with 8 or 16 bits a channel")
+    if image.mode.startswith("I;16"):
+        grey = np.rint(np.array(image).astype(np.float64) / 257).astype(np.uint8)  # 65535 is 255
+        return np.repeat(grey[..., None], 3, axis=2)
+    return np.array(image.convert("RGB"))
 
 
 def _read_image(path: Path) -> Image.Image:

@@ -8,6 +8,7 @@ Colour and depth of this Kinect were not registered to each other: colours lie s
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -21,7 +22,14 @@ from persist_cli.api.cameras import check_intrinsics, check_pose
 from persist_cli.api.importer import ForeignTrajectory, Importer
 from persist_cli.api.observations import Frame, TrajectoryInfo
 from persist_cli.data.importers.checking import FIT_NAME, is_fit_name
-from persist_cli.data.importers.gravity import Array, Direction, estimate_up, level_up
+from persist_cli.data.importers.gravity import (
+    FROM_CAMERAS,
+    FROM_SURFACES,
+    Array,
+    Direction,
+    estimate_up,
+    level_up,
+)
 from persist_cli.data.importers.readers import read_color, read_depth, read_matrix
 from persist_cli.errors import DataError
 
@@ -59,53 +67,108 @@ class SevenScenes(Importer):
         Raises:
             DataError: when there is none, or what a whole sequence needs is missing or wrong.
         """
-        source = source.resolve()
+        source = Path(os.path.abspath(source))  # a link keeps its own name
         if not source.is_dir():
             raise DataError(f"{source}: no such folder")
-        folders = [path for path in source.iterdir() if path.is_dir() and SEQUENCE.match(path.name)]
-        sequences = sorted(folders, key=lambda folder: _numbered(folder.name))
-        if any(source.glob("frame-*")):
-            sequences = [source]
-        if not sequences:
+        folders = [source] if any(source.glob("frame-*")) else _sequence_folders(source)
+        if not folders:
             raise DataError(f"{source}: neither frame-*.color files nor seq-* folders in it")
-        for folder in sequences:
-            yield _sequence(folder)
+        up: tuple[Direction, str] | None = None
+        for folder in folders:
+            sequence = CapturedSequence.read(folder)
+            up = up or _world_up(_of_one_world(sequence))
+            yield _trajectory(sequence, up)
 
 
-def _sequence(folder: Path) -> ForeignTrajectory:
-    is_part = bool(SEQUENCE.match(folder.name))
-    scene = folder.parent.name if is_part else folder.name
-    name = f"{scene}-{folder.name}" if is_part else scene
+@dataclass(frozen=True)
+class CapturedSequence:
+    """What is known of a sequence before its images are read.
+
+    Args:
+        folder: where its files are.
+        files: the files of every frame in order.
+        poses: world_from_camera of each, or why it cannot be used.
+        intrinsics: ``[3, 3]`` in pixels, top-left pixel centre at (0.5, 0.5).
+    """
+
+    folder: Path
+    files: list[FrameFiles]
+    poses: list[Array | DataError]
+    intrinsics: Array
+
+    @property
+    def is_part(self) -> bool:
+        """Whether it is one of the sequences of a scene."""
+        return bool(SEQUENCE.match(self.folder.name))
+
+    @property
+    def posed(self) -> list[tuple[FrameFiles, Array, Array]]:
+        """The files, pose and intrinsics of each frame whose pose can be used."""
+        frames = zip(self.files, self.poses, strict=True)
+        return [(frame, pose, self.intrinsics) for frame, pose in frames if not isinstance(pose, DataError)]
+
+    @staticmethod
+    def read(folder: Path) -> CapturedSequence:
+        """Read all poses of a sequence.
+
+        Raises:
+            DataError: when there is no frame, no pose that can be used, or no matrix of the camera.
+        """
+        files = _frame_files(folder)
+        sequence = CapturedSequence(folder, files, [_pose(frame) for frame in files], _intrinsics(folder))
+        if not sequence.posed:
+            raise DataError(
+                f"{folder}: none of its {len(files)} frames has a pose that can be used; {sequence.poses[0]}"
+            )
+        return sequence
+
+
+def _sequence_folders(scene: Path) -> list[Path]:
+    """The ``seq-*`` folders of a scene in the order of their numbers."""
+    folders = [path for path in scene.iterdir() if path.is_dir() and SEQUENCE.match(path.name)]
+    return sorted(folders, key=lambda folder: _numbered(folder.name))
+
+
+def _of_one_world(sequence: CapturedSequence) -> list[CapturedSequence]:
+    """All sequences that share the world of one, whichever of them are imported; none that cannot be read."""
+    sequences = []
+    for folder in _sequence_folders(sequence.folder.parent) if sequence.is_part else [sequence.folder]:
+        with contextlib.suppress(DataError):  # it is reported when its turn comes
+            sequences.append(sequence if folder == sequence.folder else CapturedSequence.read(folder))
+    return sequences
+
+
+def _trajectory(sequence: CapturedSequence, up: tuple[Direction, str]) -> ForeignTrajectory:
+    """A sequence as a trajectory; ``up`` is the axis and where it comes from."""
+    folder, files = sequence.folder, sequence.files
+    scene = folder.parent.name if sequence.is_part else folder.name
+    name = f"{scene}-{folder.name}" if sequence.is_part else scene
     if not is_fit_name(name):
         raise DataError(f"{folder}: rename the folder, since its trajectory cannot be named {name!r}; {FIT_NAME}")
-    files = _frame_files(folder)
-    intrinsics = _intrinsics(folder)
-    poses = [_pose(frame) for frame in files]
-    if all(isinstance(pose, DataError) for pose in poses):
-        raise DataError(f"{folder}: none of its {len(files)} frames has a pose that can be used; {poses[0]}")
     height, width = _image_size(files)
     info = TrajectoryInfo(
         scene=scene,
-        intrinsics=intrinsics,
+        intrinsics=sequence.intrinsics,
         height=height,
         width=width,
-        world_up=_world_up(files, poses, intrinsics),
+        world_up=up[0],
         vocabulary=free_motion(),
-        source={"format": "7scenes", "folder": folder.name, "world_up": "estimated from cameras and level surfaces"},
+        source={"format": "7scenes", "folder": folder.name, "world_up": up[1]},
     )
-    return ForeignTrajectory(name, info, _frames(files, poses, info), len(files))
+    return ForeignTrajectory(name, info, _frames(files, sequence.poses, info), len(files))
 
 
-def _world_up(files: list[FrameFiles], poses: list[Array | DataError], intrinsics: Array) -> Direction:
-    """The direction up, from all usable poses and from the depth of some of their frames."""
-    posed = [(frame, pose) for frame, pose in zip(files, poses, strict=True) if not isinstance(pose, DataError)]
-    up = estimate_up(np.stack([pose for _, pose in posed]))
+def _world_up(sequences: list[CapturedSequence]) -> tuple[Direction, str]:
+    """The direction up, from all usable poses and from the depth of some of their frames, and what it rests on."""
+    posed = [frame for sequence in sequences for frame in sequence.posed]
+    up = estimate_up(np.stack([pose for _, pose, _ in posed]))
     chosen = np.linspace(0, len(posed) - 1, min(FRAMES_FOR_UP, len(posed))).round().astype(int)
     views = []
-    for frame, pose in (posed[number] for number in chosen):
+    for frame, pose, intrinsics in (posed[number] for number in chosen):
         with contextlib.suppress(DataError):  # the frame itself is reported when its turn comes
-            views.append((read_depth(frame.depth, 1000.0, NO_DEPTH), pose))
-    return level_up(up, views, intrinsics)
+            views.append((read_depth(frame.depth, 1000.0, NO_DEPTH), pose, intrinsics))
+    level = level_up(up, views)
+    return (up, FROM_CAMERAS) if level is None else (level, FROM_SURFACES)
 
 
 def _frame_files(folder: Path) -> list[FrameFiles]:

@@ -19,7 +19,7 @@ from persist_cli.data.importers.seven_scenes import SevenScenes
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError, PersistError, PluginError
 from persist_cli.io.files import ASIDE
-from tests.support.rooms import Room, walk, write_sequence
+from tests.support.rooms import UP, Room, walk, write_sequence
 
 ROOM = Room()
 
@@ -53,6 +53,54 @@ def test_the_sequences_of_a_scene_share_its_name(tmp_path: Path) -> None:
     assert [trajectory.name for trajectory in trajectories] == ["chess-seq-01", "chess-seq-02"]
     assert {trajectory.info.scene for trajectory in trajectories} == {"chess"}
     assert next(SevenScenes().trajectories(tmp_path / "chess/seq-02")).name == "chess-seq-02"
+
+
+def two_sequences(scene: Path) -> Path:
+    """Two sequences whose cameras differ in how they are rolled, so that each alone would say another up."""
+    for number, roll in enumerate((6.0, -9.0), 1):
+        folder = write_sequence(scene / f"seq-0{number}", 3)
+        for path in folder.glob("*.pose.txt"):
+            np.savetxt(path, np.loadtxt(path) @ rolled(roll))
+    return scene
+
+
+def rolled(degrees: float) -> np.ndarray:
+    turn = np.eye(4)
+    cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    turn[:2, :2] = [[cos, -sin], [sin, cos]]
+    return turn
+
+
+def test_the_sequences_of_a_scene_share_its_up_axis_whichever_are_imported(tmp_path: Path) -> None:
+    scene = two_sequences(tmp_path / "chess")
+    ups = [trajectory.info.world_up for trajectory in SevenScenes().trajectories(scene)]
+    later = next(SevenScenes().trajectories(scene / "seq-02")).info.world_up
+    shutil.move(scene / "seq-01", tmp_path / "alone")
+    assert ups == [later, later] != [next(SevenScenes().trajectories(scene)).info.world_up] * 2
+
+
+def test_a_capture_under_another_name_has_that_name(sequence: Path, tmp_path: Path) -> None:
+    (tmp_path / "hall").symlink_to(sequence)
+    assert next(SevenScenes().trajectories(tmp_path / "hall")).name == "hall"
+
+
+def test_the_up_axis_can_be_given_and_is_shown(persist, sequence: Path, tmp_path: Path) -> None:
+    result = persist("import", "7scenes", sequence, "--out", tmp_path / "out", "--up", "-1,0,0")
+    assert (result.code, "-1.00, 0.00, 0.00" in result.out) == (0, True)
+    info = Store(tmp_path / "out")[0].info
+    assert (info.world_up, info.source["world_up"]) == ((-1.0, 0.0, 0.0), "given")
+    assert "-1.00, 0.00, 0.00 (given)" in persist("inspect", tmp_path / "out", "--pairs", 1).out
+    again = persist("import", "7scenes", sequence, "--out", tmp_path / "out")
+    assert (again.code, "of other settings" in again.err) == (1, True)
+
+
+def test_an_up_axis_without_level_surfaces_is_said_to_be_guessed(persist, sequence: Path, tmp_path: Path) -> None:
+    for path in sequence.glob("*.depth.png"):
+        Image.fromarray(np.zeros((48, 64), np.uint16)).save(path)
+    result = persist("import", "7scenes", sequence, "--out", tmp_path / "out")
+    assert "no level surface was found in kitchen: up is only guessed" in result.err
+    given = persist("import", "7scenes", sequence, "--out", tmp_path / "given", "--up", "0,1,0")
+    assert "level surface" not in given.err
 
 
 def test_timestamps_follow_the_frame_numbers(sequence: Path) -> None:
@@ -143,6 +191,8 @@ def test_import_writes_a_store_of_the_size_given(sequence: Path, tmp_path: Path,
             "causes": [],
             "height": 24,
             "width": 24,
+            "world_up": [pytest.approx(value, abs=0.01) for value in UP],
+            "world_up_is": "estimated from cameras and level surfaces",
             "state": "written",
         },
     ]
