@@ -280,7 +280,8 @@ def _is_imported(path: Path, info: TrajectoryInfo, plan: ImportPlan, trajectory:
         whole = kept.info(trajectory.info)
         infos.append(replace(whole, source=whole.source | kept.source(trajectory)))
     if not length_fits or schema(file.info).metadata not in [schema(one).metadata for one in infos]:
-        raise DataError(f"{path}: holds another trajectory or one of other settings; remove it or take another --out")
+        other = "holds another trajectory, one of other settings, or files have changed"
+        raise DataError(f"{path}: {other}; remove it or take another --out")
     return True
 
 

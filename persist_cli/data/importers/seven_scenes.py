@@ -8,6 +8,7 @@ Colour and depth of this Kinect were not registered to each other: colours lie s
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import re
 from collections.abc import Iterator
@@ -153,9 +154,16 @@ def _trajectory(sequence: CapturedSequence, up: tuple[Direction, str]) -> Foreig
         width=width,
         world_up=up[0],
         vocabulary=free_motion(),
-        source={"format": "7scenes", "folder": folder.name, "world_up": up[1]},
+        source={"format": "7scenes", "folder": folder.name, "world_up": up[1], "files": _digest(files)},
     )
     return ForeignTrajectory(name, info, _frames(files, sequence.poses, info), len(files))
+
+
+def _digest(files: list[FrameFiles]) -> str:
+    """A short hash of the names and sizes of all files, which tells a recording from a mended or another one."""
+    paths = [path for frame in files for path in (frame.color, frame.depth, frame.pose) if path.is_file()]
+    text = "\n".join(f"{path.name} {path.stat().st_size}" for path in paths)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def _world_up(sequences: list[CapturedSequence]) -> tuple[Direction, str]:

@@ -333,6 +333,19 @@ def test_a_bad_frame_among_those_held_out_leaves_nothing_and_can_then_be_left_ou
     assert lengths == [7, 6, 10, 9]
 
 
+def test_a_recording_that_was_mended_is_not_taken_for_the_one_that_was_imported(tmp_path: Path) -> None:
+    sequence = write_sequence(tmp_path / "kitchen", 4)
+    image = sorted(sequence.glob("*.color.png"))[2]
+    whole = image.read_bytes()
+    image.write_bytes(whole[:100])
+    run_import("7scenes", sequence, tmp_path / "out", ImportPlan(skip_bad=True), False)
+    assert len(Store(tmp_path / "out")[0]) == 3
+    run_import("7scenes", sequence, tmp_path / "out", ImportPlan(skip_bad=True), False)  # already there
+    image.write_bytes(whole)
+    with pytest.raises(DataError, match="or files have changed; remove it or take another --out"):
+        run_import("7scenes", sequence, tmp_path / "out", ImportPlan(skip_bad=True), False)
+
+
 def test_an_out_that_is_a_file_is_refused_before_anything_is_read(tmp_path: Path) -> None:
     (tmp_path / "out").touch()
     with pytest.raises(PersistError, match=r"no folder can be made there, .*out is a file"):
