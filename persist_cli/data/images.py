@@ -18,7 +18,8 @@ from persist_cli.errors import DataError
 MILLIMETRES = 1000.0  # in a metre
 FARTHEST = 65.535  # metres; 16 bits of millimetres hold no more
 COMPRESSION = 1  # of 9: a third of the time of the default for a few per cent more bytes
-SIZE = re.compile(r"^(?P<height>\d+)x(?P<width>\d+)$")
+SIZE = re.compile(r"^(?P<height>\d{1,9})x(?P<width>\d{1,9})$")
+LARGEST_SIDE = 4096  # pixels that can be asked for, as of a simulator
 
 Array = np.ndarray[Any, Any]
 
@@ -77,12 +78,17 @@ def parse_size(text: str) -> tuple[int, int]:
     """Height and width in pixels of the text form ``"240x320"``.
 
     Raises:
-        DataError: when it is not of this form.
+        DataError: when it is not of this form, or larger than ``LARGEST_SIDE``.
     """
     match = SIZE.match(text.lower().replace("×", "x"))
     if match is None or not int(match["height"]) or not int(match["width"]):
         raise DataError(f"cannot read the size {text!r}; write HEIGHTxWIDTH in pixels, as in 240x320")
-    return int(match["height"]), int(match["width"])
+    height, width = int(match["height"]), int(match["width"])
+    if max(height, width) > LARGEST_SIDE:
+        raise DataError(
+            f"the size {text!r} is beyond {LARGEST_SIDE}x{LARGEST_SIDE} pixels; name a smaller one, as in 240x320"
+        )
+    return height, width
 
 
 def crop_resize(source: tuple[int, int], size: tuple[int, int]) -> CropResize:

@@ -83,14 +83,15 @@ def parse_reference(text: str) -> Reference:
 
     Args:
         text: DATA is a folder, or ``sample``; the trajectory is a name or a number (a name that is a number wins);
-            frames are ``12``, or ``0-48`` where frame 48 is not included.
+            frames are ``12``, or ``0-48`` where frame 48 is not included. A folder of all the text, ``#`` included,
+            wins.
 
     Raises:
         DataError: when it is not of this form, or names the packaged sample and there is none.
     """
     folder, sharp, rest = text.rpartition("#")
-    if not sharp:
-        folder, rest = text, ""
+    if not sharp or Path(text).is_dir():
+        folder, sharp, rest = text, "", ""
     trajectory, colon, frames = rest.rpartition(":")
     if not colon:
         trajectory, frames = rest, ""

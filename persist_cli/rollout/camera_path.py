@@ -150,7 +150,12 @@ def path_along_actions(start: Trajectory, text: str) -> CameraPath:
 
 
 def path_of_trajectory(file: TrajectoryFile, first: int, frames: int) -> CameraPath:
-    """Return a trajectory's own path from frame ``first`` on, of at most ``frames`` frames (0: all) and their truth."""
+    """Return a trajectory's own path from frame ``first`` on, of at most ``frames`` frames (0: all) and their truth.
+
+    Raises:
+        DataError: when there is no such frame, or none after it.
+    """
+    (first,) = file.frame_numbers([first])
     last = min(len(file), first + 1 + frames) if frames else len(file)
     if last - first < 2:
         raise DataError(f"{file.name}: frame {first} is the last; there is nothing to follow")

@@ -68,6 +68,11 @@ def test_a_text_that_is_no_size_is_refused(text: str) -> None:
         parse_size(text)
 
 
+def test_a_size_that_would_fill_the_memory_is_refused() -> None:
+    with pytest.raises(DataError, match="'100000x64' is beyond 4096x4096 pixels"):
+        parse_size("100000x64")
+
+
 def test_a_size_is_height_by_width() -> None:
     assert parse_size("240x320") == (240, 320)
 

@@ -49,6 +49,12 @@ def test_a_reference_opens_what_it_names(folder: Path) -> None:
     assert parse_reference(f"{folder}#7").single().name == "7"  # a name before a number
 
 
+def test_the_folder_of_a_data_set_may_have_a_sharp_in_its_name(folder: Path, tmp_path: Path) -> None:
+    moved = folder.rename(tmp_path.with_name(f"{tmp_path.name}#2"))
+    assert len(parse_reference(f"{moved}").trajectories()) == 3
+    assert parse_reference(f"{moved}#a:2").single().name == "a"
+
+
 def test_a_start_is_one_frame_and_not_a_range(folder: Path) -> None:
     assert parse_reference(f"{folder}#a:2").frame == 2
     assert parse_reference(f"{folder}#a").frame == 0

@@ -10,8 +10,10 @@ from persist_cli.api.backbone import Sampling
 from persist_cli.api.memory import FrameOfReference
 from persist_cli.api.observations import Origin
 from persist_cli.data.store import Store
+from persist_cli.errors import DataError
 from persist_cli.memorize.memory_file import load_memory, load_paths
 from persist_cli.plugins import make_encoder, make_memory
+from persist_cli.rollout.camera_path import path_of_trajectory
 from persist_cli.rollout.outputs import quaternion
 from persist_cli.rollout.world_model import Agent, WorldModel
 from persist_cli.viewing.video import read_video
@@ -133,6 +135,14 @@ def test_rollouts_that_cannot_work_are_refused_in_one_line(persist, voxel, stage
     assert not (tmp_path / "o").exists()
     result = persist("rollout", voxel, "--start", f"{walks}#0:99", *left, "--out", tmp_path / "o")
     assert (result.code, "99" in result.err) == (1, True)
+
+
+def test_following_from_a_frame_without_a_next_one_says_why(walks):
+    file = Store(walks)[0]
+    with pytest.raises(DataError, match=rf"has {len(file)} frames .* there is no frame 99"):
+        path_of_trajectory(file, 99, 0)
+    with pytest.raises(DataError, match=f"frame {len(file) - 1} is the last; there is nothing to follow"):
+        path_of_trajectory(file, len(file) - 1, 0)
 
 
 def test_a_run_that_moved_with_its_base_still_loads(persist, voxel, walks, tmp_path):

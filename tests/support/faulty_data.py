@@ -16,11 +16,28 @@ Change = Callable[[Frame, TrajectoryInfo], Frame]
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def rewrite(good: Path, bad: Path, change: Change, intrinsics: float = 1.0, focal: float = 1.0) -> Path:
-    """Write the trajectory with every frame changed, and two rows of the intrinsics, or fx and fy, multiplied."""
+def rewrite(
+    good: Path,
+    bad: Path,
+    change: Change,
+    intrinsics: float = 1.0,
+    focal: float = 1.0,
+    principal: Callable[[float, float], tuple[float, float]] = lambda x, y: (x, y),
+) -> Path:
+    """Write the trajectory with every frame changed.
+
+    Args:
+        good: the trajectory.
+        bad: the file to write.
+        change: what becomes of each frame.
+        intrinsics: what their first two rows are multiplied by.
+        focal: what fx and fy are multiplied by.
+        principal: gives the principal point for the true one, pixels.
+    """
     file = TrajectoryFile(good)
     matrix = np.diag([intrinsics, intrinsics, 1.0]) @ file.info.intrinsics
     matrix[:2, :2] *= focal
+    matrix[:2, 2] = principal(*matrix[:2, 2])
     info = replace(file.info, intrinsics=matrix)
     write_trajectory(bad, info, (change(frame, file.info) for frame in _frames(file)))
     return bad

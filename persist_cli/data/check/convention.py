@@ -33,6 +33,10 @@ RATIOS = (0.25, 0.33, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.1, 1.25, 1.4, 1.6, 2.0, 2.
 GROSS = (0.2, 0.5, 2.0, 5.0)
 FINER = (0.8, 0.85, 0.9, 0.94, 0.97, 1.03, 1.06, 1.1, 1.15, 1.2)  # between two of the ratios
 FOCAL = "focal length"
+PRINCIPAL = "principal point"
+OFF_CENTRE = 0.02  # of the images' width or height: nearer to each other, two principal points count as one
+FAR_OFF = 0.25  # a principal point so far from the true one is a gross fault ...
+GROSSLY_OFF = 0.1  # ... and one that lies this far from the images' middle may be one
 
 # Real Kinect data (7-Scenes kitchen) has a median relative error of 0.006 and a depth score of 0.08, where a wrong
 # hypothesis scores at least 0.11; exact renderings score 0.01. With any fault of the list the score is 0.19 to 1,
@@ -183,7 +187,8 @@ def score(errors: Sequence[ReprojectionErrors]) -> Score:
 def hypotheses(cameras: Cameras) -> list[Hypothesis]:
     """Every fault that is tried on frames of these cameras."""
     focal = [_scaled_focal_length(cameras, ratio) for ratio in RATIOS]
-    return [*_pose_faults(), _depth_along_the_ray(), *_depth_units(), *_intrinsics_of_another_size(cameras), *focal]
+    intrinsics = [*_intrinsics_of_another_size(cameras), *_principal_points(cameras), *focal]
+    return [*_pose_faults(), _depth_along_the_ray(), *_depth_units(), *intrinsics]
 
 
 def _reproject_all(pairs: Iterable[Observations], advance: Callable[[], None]) -> list[ReprojectionErrors]:
@@ -312,6 +317,37 @@ def _scaled_intrinsics(cameras: Cameras, x: float, y: float) -> Hypothesis:
     return Hypothesis("intrinsics of another size", cause, partial(_with_scaled_intrinsics, x=x, y=y), x in GROSS)
 
 
+def _principal_points(cameras: Cameras) -> list[Hypothesis]:
+    """The two numbers exchanged, the middle of the images, and places far off along each axis."""
+    x, y = (float(value) for value in cameras.intrinsics[0, :2, 2])
+    width, height, middle = cameras.width, cameras.height, (cameras.width / 2, cameras.height / 2)
+    here = f"({x:.4g}, {y:.4g}) in images of {height}×{width} (height×width)"
+    faults = []
+    if _apart((x, y), (y, x), cameras) > OFF_CENTRE:
+        cause = f"cx and cy look exchanged, the principal point is {here}: exchange them"
+        faults.append(_principal_point(cause, (y, x), cameras))
+    if _apart((x, y), middle, cameras) > OFF_CENTRE and not (faults and _apart((y, x), middle, cameras) <= OFF_CENTRE):
+        cause = f"the principal point looks wrong, {here}: take their middle, cx = {middle[0]:g} and cy = {middle[1]:g}"
+        faults.append(_principal_point(cause, middle, cameras))
+    for across, down in ((FAR_OFF, 0), (-FAR_OFF, 0), (0, FAR_OFF), (0, -FAR_OFF)):
+        place = x + across * width, y + down * height
+        cause = f"the principal point looks wrong, {here}: it should lie at about ({place[0]:.3g}, {place[1]:.3g})"
+        faults.append(_principal_point(cause, place, cameras))
+    return faults
+
+
+def _principal_point(cause: str, place: tuple[float, float], cameras: Cameras) -> Hypothesis:
+    """The fault of a principal point that should lie at ``place``."""
+    x, y = (float(value) for value in cameras.intrinsics[0, :2, 2])
+    is_gross = _apart((x, y), place, cameras) > GROSSLY_OFF
+    return Hypothesis(PRINCIPAL, cause, partial(_with_principal_point, place=place), is_gross)
+
+
+def _apart(one: tuple[float, float], other: tuple[float, float], cameras: Cameras) -> float:
+    """How far two pixels (u, v) are apart along the axis on which it is more, as a share of the images' size."""
+    return max(abs(one[0] - other[0]) / cameras.width, abs(one[1] - other[1]) / cameras.height)
+
+
 def _scaled_focal_length(cameras: Cameras, ratio: float) -> Hypothesis:
     focal = float(cameras.intrinsics[0, 0, 0])
     now, then = (math.degrees(2 * math.atan(cameras.width / 2 / value)) for value in (focal, focal * ratio))
@@ -352,6 +388,12 @@ def _with_scaled_depth(pair: Observations, scale: float) -> Observations:
 def _with_scaled_focal_length(pair: Observations, scale: float) -> Observations:
     factors = pair.cameras.intrinsics.new_tensor([[scale, 1.0, 1.0], [1.0, scale, 1.0], [1.0, 1.0, 1.0]])
     return replace(pair, cameras=replace(pair.cameras, intrinsics=pair.cameras.intrinsics * factors))
+
+
+def _with_principal_point(pair: Observations, place: tuple[float, float]) -> Observations:
+    intrinsics = pair.cameras.intrinsics.clone()
+    intrinsics[..., :2, 2] = intrinsics.new_tensor(place)
+    return replace(pair, cameras=replace(pair.cameras, intrinsics=intrinsics))
 
 
 def _with_scaled_intrinsics(pair: Observations, x: float, y: float) -> Observations:

@@ -155,6 +155,7 @@ def figures_table(figures: Sequence[TrajectoryFigures], effects: Mapping[str, st
         taken.update(one.actions)
     known = {name: f": {effect}" for name, effect in effects.items()}
     names = [*known, *(name for name in taken if name not in known)]
+    sources = [one.world_up_is for one in figures if one.world_up_is]
     with_cells = sum(one.cells for one in figures)
     return [
         ("trajectories", str(len(figures))),
@@ -162,7 +163,8 @@ def figures_table(figures: Sequence[TrajectoryFigures], effects: Mapping[str, st
         ("frames", _total([one.frames for one in figures], str)),
         ("image size", _distinct([f"{one.size[0]}×{one.size[1]}" for one in figures])),
         ("field of view", _distinct([f"{one.field_of_view:.1f}°" for one in figures])),
-        ("up in the world (x, y, z)", _distinct([_up(one) for one in figures])),
+        ("up axis", _distinct([up_text(one.world_up) for one in figures])),
+        *([("up axis is", _distinct(sources))] if sources else []),
         ("metres travelled", _total([one.metres for one in figures], "{:.2f}".format)),
         ("degrees turned", _total([one.turned for one in figures], "{:.0f}".format)),
         ("seconds", _total([one.seconds for one in figures], "{:.1f}".format)),
@@ -216,11 +218,6 @@ def _inspect(
         tries = len(hypotheses(frames[0].cameras)) * min(len(frames), MOST_TRIED) if frames else 0
         task = add_task(bar, "reprojections", len(frames) + tries, "reprojections")
         return figures, check_convention(frames, partial(bar.advance, task))
-
-
-def _up(figures: TrajectoryFigures) -> str:
-    """The up axis, and where it comes from."""
-    return up_text(figures.world_up) + (f" ({figures.world_up_is})" if figures.world_up_is else "")
 
 
 def _print_other(path: str, other: str, json: bool) -> None:

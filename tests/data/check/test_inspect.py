@@ -102,6 +102,29 @@ def test_a_wrong_focal_length_is_named_with_its_likely_ratio(
     assert float(ratio) == pytest.approx(1 / focal, rel=0.08)
 
 
+@pytest.mark.parametrize("data", ["room", "kitchen"])
+def test_a_wrong_principal_point_is_named(request: pytest.FixtureRequest, tmp_path: Path, data: str) -> None:
+    for name, principal, cause in (
+        ("exchanged", lambda x, y: (y, x), "cx and cy look exchanged"),
+        ("off", lambda x, y: (1.25 * x, y), "principal point looks wrong, .*: take their middle, cx ="),
+    ):
+        file = tmp_path / f"{name}.parquet"
+        bad = faults.rewrite(request.getfixturevalue(data), file, faults.good, principal=principal)
+        check, code = inspect(bad, request.getfixturevalue("capsys"))
+        assert (check["verdict"], code) == ("suspicious", 1)
+        assert re.search(cause, check["cause"])
+        assert "; or " not in check["cause"]
+
+
+def test_a_principal_point_that_the_motion_does_not_show_is_undecided(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sideways = np.stack([look((0.1 * x - 1, 1.4, -0.5), 0, 0) for x in range(12)])
+    check, code = inspect(Room().write(tmp_path / "wall.parquet", sideways), capsys)
+    assert (check["verdict"], code) == ("ok", 0)
+    assert "principal point" in check["undecided"]
+
+
 def test_poses_of_other_images_are_suspicious_without_a_known_cause(
     room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
