@@ -18,7 +18,7 @@ from persist_cli.errors import DataError, PluginError
 from persist_cli.simulators.collect import CollectPlan, run_collect
 from tests.support.packages import install
 
-PLAN = CollectPlan("hall", "0:2", frames=24, size="8x8")
+PLAN = CollectPlan(simulator="hall", scenes="0:2", frames=24, size="8x8")
 SIDE = 4.0  # metres from the middle of the hall to its walls
 
 
