@@ -36,10 +36,10 @@ from persist_cli.memorize.factory import MemoryFactory, as_scene
 from persist_cli.memorize.memory_config import scene_config
 from persist_cli.navigation.ground_mapper import GroundMapper, body_of
 from persist_cli.navigation.ways import way_is_free
+from persist_cli.output.console import add_task, busy, print_json, print_table, progress, say
 from persist_cli.plugins import check_simulator, make_simulator
 from persist_cli.rollout.world_model import Agent, WorldModel
 from persist_cli.simulators.collect import CollectPlan
-from persist_cli.viewing.console import add_task, busy, print_json, print_table, progress, say
 
 SHARES: Final = {"forward": 0.6, "backward": 0.1, "left": 0.15, "right": 0.15}  # how often an action is drawn
 

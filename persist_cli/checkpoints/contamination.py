@@ -13,8 +13,8 @@ from persist_cli.checkpoints.lineage import training_scenes
 from persist_cli.data.held_out import SEQUENCE, scene_was_trained_on
 from persist_cli.data.store import TrajectoryFile
 from persist_cli.errors import DataError
+from persist_cli.output.console import warn
 from persist_cli.policies.trained import TrainedPolicy
-from persist_cli.viewing.console import warn
 
 OTHER_DATA: Final = "take data of another split"
 

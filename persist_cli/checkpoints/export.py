@@ -43,10 +43,10 @@ from persist_cli.io.files import (
     write_text,
 )
 from persist_cli.io.sha256sums import SUMS, read_sums, write_sums
+from persist_cli.output.console import busy, print_json, print_table, say, watched
 from persist_cli.plugins import load_plugin
 from persist_cli.policies.trained import find_policy, is_policy, write_policy_card
 from persist_cli.recipe import parse_yaml_mapping
-from persist_cli.viewing.console import busy, print_json, print_table, say, watched
 
 PRECISIONS: Final = {"float16": torch.float16, "bfloat16": torch.bfloat16, "float32": torch.float32}
 

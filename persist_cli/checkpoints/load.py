@@ -15,9 +15,9 @@ from persist_cli.checkpoints.scene_models import with_absolute_model, with_model
 from persist_cli.errors import CheckpointError, RecipeError
 from persist_cli.io.files import read_json
 from persist_cli.io.settings import parse_settings
+from persist_cli.output.console import warn
 from persist_cli.plugins import load_plugin
 from persist_cli.recipe import BackboneConfig, MemoryConfig, Recipe, recipe_values
-from persist_cli.viewing.console import warn
 
 if TYPE_CHECKING:
     from persist_cli.api.backbone import Backbone, Sampling

@@ -6,7 +6,7 @@ import torch
 
 from persist_cli.api.half_precision import is_slow
 from persist_cli.api.inference import InferenceOptions
-from persist_cli.viewing.console import warn
+from persist_cli.output.console import warn
 
 
 def check_placement(placement: InferenceOptions) -> None:

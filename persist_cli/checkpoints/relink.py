@@ -26,7 +26,7 @@ from persist_cli.checkpoints.save import card_fingerprint, hash_weights, pointer
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import json_text
 from persist_cli.io.sha256sums import rewrite_files
-from persist_cli.viewing.console import say
+from persist_cli.output.console import say
 
 HUB_NAME: Final = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")  # owner/model
 

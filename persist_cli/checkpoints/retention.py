@@ -19,8 +19,8 @@ from persist_cli.checkpoints.lineage import RECIPE
 from persist_cli.errors import PersistError
 from persist_cli.io.command_line import quoted
 from persist_cli.io.files import empty_folder_aside, read_json, write_json
+from persist_cli.output.console import warn
 from persist_cli.recipe import recipe_values
-from persist_cli.viewing.console import warn
 
 USERS: Final = "used-by"  # the folder of the marks, beside the checkpoints of a run
 

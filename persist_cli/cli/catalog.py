@@ -19,7 +19,7 @@ catalog_app.add_typer(weights_app, name="weights")
 @catalog_app.command()
 def plugins(json: JsonOption = False) -> None:
     """List every plugin: backbones, memories, encoders, simulators, importers, policies, costs, scene models."""
-    from persist_cli.viewing.listings import show_plugins
+    from persist_cli.output.listings import show_plugins
 
     show_plugins(json)
 
@@ -34,10 +34,10 @@ def recipes(
     persist recipes tiny-stage1 > mine.yaml
     """
     if name is None:
-        from persist_cli.viewing.listings import show_recipes
+        from persist_cli.output.listings import show_recipes
 
         return show_recipes(json)
-    from persist_cli.viewing.recipe_page import show_recipe
+    from persist_cli.output.recipe_page import show_recipe
 
     show_recipe(name, json)
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Final
 
 from persist_cli.doctor.machine import Machine
+from persist_cli.output.console import watched
 from persist_cli.recipe import Recipe, network_of, of_the_whole_model
-from persist_cli.viewing.console import watched
 
 
 @dataclass(frozen=True)

@@ -37,9 +37,9 @@ from persist_cli.doctor.meta_model import (
 )
 from persist_cli.doctor.step import check_savings
 from persist_cli.errors import PersistError
+from persist_cli.output.console import busy, print_json, print_table, say, watched
 from persist_cli.recipe import Recipe, apply_overrides, make_recipe, of_the_whole_model, to_plain
 from persist_cli.train.distributed import check_sharded
-from persist_cli.viewing.console import busy, print_json, print_table, say, watched
 
 COLUMNS: Final = ("weights", "gradients", "optimizer", "average", "encoding", "activations", "update", "peak")
 

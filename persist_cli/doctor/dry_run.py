@@ -12,10 +12,10 @@ from persist_cli.api.stages import ParameterGroup, Stage
 from persist_cli.checkpoints.scene_models import check_stage
 from persist_cli.doctor.machine import gib
 from persist_cli.doctor.meta_model import MetaModel, build_meta_model
+from persist_cli.output.console import print_json, print_table
 from persist_cli.plugins import make_scene_model
 from persist_cli.policies.trained import make_network
 from persist_cli.recipe import ALONE, Recipe, apply_overrides, make_recipe, read_recipe
-from persist_cli.viewing.console import print_json, print_table
 
 
 def run_dry_run(recipe: str, overrides: Sequence[str], json: bool) -> None:

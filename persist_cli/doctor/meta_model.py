@@ -25,9 +25,9 @@ from persist_cli.checkpoints.scene_models import check_stage
 from persist_cli.doctor.memory_estimate import BackboneEstimator, SceneEstimator
 from persist_cli.errors import RecipeError
 from persist_cli.memorize.factory import MemoryFactory
+from persist_cli.output.console import warn
 from persist_cli.plugins import make_scene_model
 from persist_cli.recipe import OF_A_BACKBONE, Recipe, apply_overrides, make_recipe, read_recipe, recipe_names
-from persist_cli.viewing.console import warn
 
 KEPT: Final = frozenset(f"training.{name}" for name in ("batch", "precision", *OF_A_BACKBONE))  # from stage 1 to 2
 

@@ -30,8 +30,8 @@ from persist_cli.editing.views import (
 from persist_cli.errors import DataError, PersistError
 from persist_cli.io.files import check_folder, remove_leftovers, write_json
 from persist_cli.memorize.memory_file import load_memory, load_paths
-from persist_cli.viewing.console import busy, print_json, print_table, say
-from persist_cli.viewing.map import draw_before_and_after
+from persist_cli.output.console import busy, print_json, print_table, say
+from persist_cli.output.map import draw_before_and_after
 
 AROUND = 2  # pixels at the border of what is edited that may change too
 

@@ -26,9 +26,9 @@ from persist_cli.data.store import TrajectoryFile
 from persist_cli.editing.locality import edited_pixels, flat_cells
 from persist_cli.errors import DataError
 from persist_cli.io.files import written_aside
+from persist_cli.output.console import busy
+from persist_cli.output.video import below, beside, enlarge, labelled
 from persist_cli.rollout.open_world import WorldOptions, assemble_world
-from persist_cli.viewing.console import busy
-from persist_cli.viewing.video import below, beside, enlarge, labelled
 
 SIDE: Final = 256  # pixels of the shorter side of a drawn view
 FIELD: Final = 75.0  # degrees of a view along a path of a memory file, which keeps no intrinsics

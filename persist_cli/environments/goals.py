@@ -20,7 +20,7 @@ from persist_cli.environments.task import TaskSettings
 from persist_cli.errors import DataError
 from persist_cli.memorize.sources import Source, common_reference, find_sources
 from persist_cli.navigation.routes import Distances, distances_to, holding
-from persist_cli.viewing.console import warn
+from persist_cli.output.console import warn
 
 ROOM = 3.0  # metres of unknown ground around all that is known, over which an agent may walk too
 

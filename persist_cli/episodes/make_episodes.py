@@ -9,9 +9,9 @@ from persist_cli.episodes.episodes import Episode, EpisodeSet
 from persist_cli.episodes.find_episodes import EpisodeSearch, find_episodes
 from persist_cli.errors import DataError
 from persist_cli.io.files import check_file
+from persist_cli.output.console import add_task, print_json, print_table, progress, say
 from persist_cli.plugins import check_simulator, make_simulator
 from persist_cli.simulators.collect import CollectPlan
-from persist_cli.viewing.console import add_task, print_json, print_table, progress, say
 
 
 def draw_episodes(scenes: CollectPlan, search: EpisodeSearch) -> EpisodeSet:

@@ -34,7 +34,7 @@ from persist_cli.evaluate.statistics import (
     weighted_mean,
 )
 from persist_cli.evaluate.windows import CURVE_COLUMNS, SHOWN, window_values, windows_of
-from persist_cli.viewing.console import watched
+from persist_cli.output.console import watched
 
 BINS = 10  # of the share of a view that was seen before
 

@@ -30,7 +30,7 @@ from persist_cli.evaluate.statistics import LEAST_UNITS, RESAMPLES
 from persist_cli.evaluate.windows import SHOWN, window_bounds
 from persist_cli.io.command_line import running_command
 from persist_cli.io.files import check_folder, write_json, write_text
-from persist_cli.viewing.console import print_json, say
+from persist_cli.output.console import print_json, say
 
 RESULTS = "metrics.json"
 

@@ -18,7 +18,7 @@ from persist_cli.evaluate.metric_suite import FIGURES, VIDEO
 from persist_cli.evaluate.plan import Evaluation
 from persist_cli.evaluate.report.pictures import ClipPicture, Pictures, RowPictures, Sheet
 from persist_cli.metrics.metric import Metric
-from persist_cli.viewing.console import add_task, progress
+from persist_cli.output.console import add_task, progress
 
 ReadClip = Callable[[int], CaseFrames]  # of a clip's number
 

@@ -44,7 +44,7 @@ from persist_cli.evaluate.rows.training_seeds import is_reordered
 from persist_cli.evaluate.statistics import RESAMPLE_UNITS
 from persist_cli.metrics import METRICS
 from persist_cli.metrics.metric import Metric
-from persist_cli.viewing.console import busy, warn
+from persist_cli.output.console import busy, warn
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,7 +21,7 @@ from persist_cli.errors import DataError
 from persist_cli.evaluate.cases import Case
 from persist_cli.evaluate.coverage import GRID, held_frames, recalled_share, seen_share
 from persist_cli.evaluate.new_poses import NEW_POSES, RETURN_DEGREES, RETURN_METRES, NewPoses, returning_frames
-from persist_cli.viewing.console import watched
+from persist_cli.output.console import watched
 
 T = TypeVar("T")
 

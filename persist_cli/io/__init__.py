@@ -1,1 +1,1 @@
-"""Files that are whole or absent, strict settings, and the Hugging Face hub."""
+"""Files that are whole or absent, strict settings, the Hugging Face hub, and addresses of pages on this machine."""

@@ -18,8 +18,8 @@ from persist_cli.episodes.run_episode import LoopSettings, run_closed_loop
 from persist_cli.episodes.stop_rules import StopByCost, StopRule
 from persist_cli.episodes.true_scene import TrueScene
 from persist_cli.errors import PersistError
+from persist_cli.output.console import watched
 from persist_cli.plugins import make_cost
-from persist_cli.viewing.console import watched
 
 # shown the goal image, given nothing else
 ROW = PlanningRow(name="policy", planner="policy", policy=None, memory=None, goal="image", walk=False)

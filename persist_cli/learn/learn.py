@@ -37,6 +37,8 @@ from persist_cli.learn.evaluation import STOP_COST, evaluate_policy, mean_figure
 from persist_cli.learn.places import ImaginedPlace, PracticePlace, TruePlace
 from persist_cli.learn.practice import PracticeSettings, info_of_walks, practise
 from persist_cli.memorize.sources import common_reference, find_sources
+from persist_cli.output.console import add_task, print_json, print_table, progress, say
+from persist_cli.output.curve import Curve, draw_curves
 from persist_cli.planning.true_futures import open_again
 from persist_cli.plugins import make_policy, make_settings
 from persist_cli.policies.open_policy import acting_settings, open_policy
@@ -45,8 +47,6 @@ from persist_cli.recipe import apply_overrides, make_recipe
 from persist_cli.rollout.open_world import WorldOptions, assemble_world
 from persist_cli.train.finetune import FinetunePlan, run_finetune
 from persist_cli.train.sources import weights_hash
-from persist_cli.viewing.console import add_task, print_json, print_table, progress, say
-from persist_cli.viewing.curve import Curve, draw_curves
 
 PLAN: Final = "plan.json"
 WALKS: Final = "walks.json"  # of a round: how many walks are done, and their counts

@@ -19,10 +19,10 @@ from persist_cli.memorize.memory_config import MemorizePlan, resolve_memory_conf
 from persist_cli.memorize.memory_file import add_paths, load_memory, load_paths
 from persist_cli.memorize.picture import PictureOptions, is_picture, refuse_picture_options, write_picture
 from persist_cli.memorize.sources import Source, common_reference, find_sources
+from persist_cli.output.console import add_task, busy, print_json, print_table, progress, say, watched
+from persist_cli.output.map import draw_map
 from persist_cli.plugins import load_plugin, make_encoder, make_memory
 from persist_cli.recipe import MemoryConfig
-from persist_cli.viewing.console import add_task, busy, print_json, print_table, progress, say, watched
-from persist_cli.viewing.map import draw_map
 
 
 def run_memorize(data: list[str], plan: MemorizePlan, picture: PictureOptions, out: Path, json: bool) -> None:

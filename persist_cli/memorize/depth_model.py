@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from persist_cli.errors import DataError
-from persist_cli.viewing.console import busy
+from persist_cli.output.console import busy
 
 ADVICE = "take one of metres, such as depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf"
 METRIC = ("zoedepth", "depth_pro")  # kinds whose models all give metres

@@ -14,9 +14,9 @@ from persist_cli.api.stages import SCENE_STAGES, Stage
 from persist_cli.checkpoints.scene_models import find_scene_model
 from persist_cli.data.store import TrajectoryFile
 from persist_cli.errors import CheckpointError
+from persist_cli.output.console import warn
 from persist_cli.plugins import load_plugin
 from persist_cli.recipe import MemoryConfig
-from persist_cli.viewing.console import warn
 
 
 def with_scene_model(memory: Memory) -> Memory:

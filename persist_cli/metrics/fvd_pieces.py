@@ -11,7 +11,7 @@ from torch import Tensor
 
 from persist_cli.metrics.fvd import LEAST_FRAMES, LEAST_VIDEOS, WEIGHTS, Fvd
 from persist_cli.metrics.networks import missing_weights
-from persist_cli.viewing.console import watched
+from persist_cli.output.console import watched
 
 Piece = UInt8[Tensor, "frame height width 3"]
 

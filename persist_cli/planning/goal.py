@@ -18,8 +18,8 @@ from persist_cli.data.importers.readers import read_photo
 from persist_cli.data.reference import parse_reference
 from persist_cli.errors import DataError
 from persist_cli.navigation.routes import check_within_reach
+from persist_cli.output.console import warn
 from persist_cli.rollout.world_model import Agent
-from persist_cli.viewing.console import warn
 
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?"
 PLACE = re.compile(rf"^\s*{NUMBER}(?:\s*,\s*{NUMBER}){{1,2}}\s*$", re.IGNORECASE)

@@ -19,13 +19,13 @@ from persist_cli.api.memory import MapPoints
 from persist_cli.api.policy import Goal
 from persist_cli.errors import PersistError
 from persist_cli.io.files import empty_folder_aside, remove_leftovers, write_json
+from persist_cli.output.map import DrawnCandidate, draw_candidates
+from persist_cli.output.sheet import write_sheet
+from persist_cli.output.video import beside, enlarge, labelled, still, write_video
 from persist_cli.planning.futures import CandidateWalk, FutureModel, Imagined, WorldFutures
 from persist_cli.planning.judge import Candidate
 from persist_cli.planning.planners import Plan
 from persist_cli.planning.true_futures import true_futures
-from persist_cli.viewing.map import DrawnCandidate, draw_candidates
-from persist_cli.viewing.sheet import write_sheet
-from persist_cli.viewing.video import beside, enlarge, labelled, still, write_video
 
 FILES: Final = ("sheet.png", "plan.mp4", "map.png", "plan.json")
 

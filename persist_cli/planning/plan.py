@@ -27,6 +27,7 @@ from persist_cli.io.files import check_folder
 from persist_cli.io.settings import parse_settings
 from persist_cli.memorize.memory_config import plugin_settings
 from persist_cli.navigation.ground_mapper import body_of, knows_floor
+from persist_cli.output.console import add_task, busy, print_json, print_table, progress, say, warn
 from persist_cli.planning.futures import Over, WorldFutures
 from persist_cli.planning.goal import check_near, read_goal
 from persist_cli.planning.judge import Budget, Judge, check_goal
@@ -38,7 +39,6 @@ from persist_cli.rollout.camera_path import walking_vocabulary
 from persist_cli.rollout.open_world import WorldOptions, assemble_world
 from persist_cli.rollout.surroundings import Surroundings
 from persist_cli.rollout.world_model import Agent, WorldModel
-from persist_cli.viewing.console import add_task, busy, print_json, print_table, progress, say, warn
 
 METHODS = {"rank": "keep", "cem": "shift"}  # with the setting of each that a single plan has no use for
 OVER: dict[str, Over] = {"last": "last", "best": "best"}

@@ -1,6 +1,6 @@
 """The map that grows while one walks: what is remembered, seen from above, with the way.
 
-Unlike the maps of ``viewing.map`` it is drawn in milliseconds, also of a million points, and without axes.
+Unlike the maps of ``output.map`` it is drawn in milliseconds, also of a million points, and without axes.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from torch import Tensor
 from persist_cli.api.cells import CellOrigin
 from persist_cli.api.ground import Cover, GroundMap
 from persist_cli.api.memory import MapPoints
+from persist_cli.output.map import ABOVE_CAMERA, LEAST_SPREAD, PATH_COLORS, UNSEEN, hatched
 from persist_cli.play.settings import GroundPose
-from persist_cli.viewing.map import ABOVE_CAMERA, LEAST_SPREAD, PATH_COLORS, UNSEEN, hatched
 
 MARGIN: Final = 0.5  # metres around all that is drawn
 LEAST: Final = 4.0  # metres of the shorter side at least, so that a single point does not fill the picture

@@ -17,13 +17,13 @@ from persist_cli.checkpoints.placement import check_placement
 from persist_cli.data.clips import check_size
 from persist_cli.errors import CheckpointError, DataError
 from persist_cli.memorize.sources import Source, find_sources
+from persist_cli.output.console import busy
 from persist_cli.play.play import Play
 from persist_cli.play.settings import PlaySettings
 from persist_cli.play.start import StartOptions, read_start
 from persist_cli.play.walkers import AdaptedWorld
 from persist_cli.rollout.open_world import body_for, open_memory
 from persist_cli.rollout.world_model import Agent
-from persist_cli.viewing.console import busy
 
 
 @dataclass(frozen=True, kw_only=True)

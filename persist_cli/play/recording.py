@@ -17,7 +17,7 @@ from persist_cli.data.store import SUFFIX, write_trajectory
 from persist_cli.errors import PersistError
 from persist_cli.io.files import check_folder
 from persist_cli.navigation.ground_mapper import body_of, tells_body
-from persist_cli.viewing.video import beside, enlarge, labelled, write_video
+from persist_cli.output.video import beside, enlarge, labelled, write_video
 
 LONGEST: Final = 5000  # frames of a recording, ten minutes at eight a second; some 150 MB at 64×64 for each memory
 RATE: Final = 8  # frames a second of the video

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Final
 
 from persist_cli.errors import PersistError
+from persist_cli.output.console import warn
 from persist_cli.play.messages import Recorded
 from persist_cli.play.play import Play
-from persist_cli.viewing.console import warn
 
 ADDRESS: Final = "/recordings/"
 NAME_BYTES: Final = 16  # of randomness in a name: who was not told it cannot guess it

@@ -14,14 +14,14 @@ from types import FrameType
 from typing import Any, Final
 
 from persist_cli.io.files import check_folder
+from persist_cli.io.own_address import EVERYWHERE, address_of, bind, is_loopback, leave, names_of, open_browser
+from persist_cli.output.console import print_json, say, warn
 from persist_cli.play.open_play import PlayOptions, open_walks
 from persist_cli.play.play import Play
 from persist_cli.play.recordings import Recordings
 from persist_cli.play.server import Server, make_app
 from persist_cli.play.sessions import Limits, Sessions
 from persist_cli.play.walking_page import walking_page
-from persist_cli.viewing.console import print_json, say, warn
-from persist_cli.viewing.own_address import EVERYWHERE, address_of, bind, is_loopback, leave, names_of, open_browser
 
 LAST_CALL_SECONDS: Final = 1.0  # that a call to the model may still take when the server has ended
 SAVING_SECONDS: Final = 120.0  # the same, where a recording is saved; a full one takes a minute or more

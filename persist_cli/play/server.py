@@ -19,11 +19,11 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
+from persist_cli.io.own_address import leads_here, same_host
 from persist_cli.play.messages import MOST_BYTES
 from persist_cli.play.recordings import ADDRESS
 from persist_cli.play.sessions import Sessions
 from persist_cli.play.walking_page import WalkingPage
-from persist_cli.viewing.own_address import leads_here, same_host
 
 # Connections beside those of sessions. Requests beyond get 503; WebSockets count, and ``Sessions`` refuses them.
 MORE_CONNECTIONS: Final = 32

@@ -25,11 +25,11 @@ from persist_cli.errors import PersistError, hint
 from persist_cli.evaluate.report.result_file import Cell, read_results
 from persist_cli.io.files import write_json, written_aside
 from persist_cli.io.hub import cached_weight
+from persist_cli.output.console import say
+from persist_cli.output.curve import Curve, draw_curves
 from persist_cli.recipe import Recipe, make_recipe, read_recipe, recipe_names
 from persist_cli.reproduce.commands import COLLECT, run_line, run_main
 from persist_cli.reproduce.plan_file import base_json, keep_plan, places
-from persist_cli.viewing.console import say
-from persist_cli.viewing.curve import Curve, draw_curves
 
 PREFIX: Final = "houses-64-paper"
 HOUSES: Final = 400  # collected for training when no data are named; a quarter of them are explored

@@ -27,10 +27,10 @@ from persist_cli.data.store import Store
 from persist_cli.errors import DataError, PersistError, hint
 from persist_cli.evaluate.report.result_file import read_results
 from persist_cli.io.files import read_json, write_json, write_text
+from persist_cli.output.console import say
 from persist_cli.recipe import EXTENDS, apply_overrides, make_recipe, read_recipe
 from persist_cli.reproduce.commands import COLLECT, run_line, run_main
 from persist_cli.reproduce.plan_file import base_json, keep_plan, places
-from persist_cli.viewing.console import say
 
 CHOICES: Final = "choices.json"
 RECIPE: Final = "houses-64-stage2-"  # begins the names of the recipes that are varied

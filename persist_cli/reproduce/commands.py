@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from persist_cli.errors import INTERRUPTED, PersistError
-from persist_cli.viewing.console import say
+from persist_cli.output.console import say
 
 COLLECT: Final = "collect miniworld --size 64x64"
 

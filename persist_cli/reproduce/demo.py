@@ -27,8 +27,8 @@ from persist_cli.errors import INTERRUPTED
 from persist_cli.evaluate.journal import Journal
 from persist_cli.io.files import read_json
 from persist_cli.io.hub import cached_weight
+from persist_cli.output.console import say
 from persist_cli.reproduce.commands import run_main
-from persist_cli.viewing.console import say
 
 HALF: Final = 32  # frames after the first that the memory is made of; what follows is the way back, by another way
 ROLLOUTS: Final = ("with-memory", "without-memory")  # folders of the two rollouts
@@ -167,8 +167,8 @@ def gather_results(out: Path, trajectory: str) -> None:
         trajectory: reference to the trajectory whose way back was rolled out.
     """
     from persist_cli.data.reference import parse_reference
-    from persist_cli.viewing.sheet import write_sheet
-    from persist_cli.viewing.video import beside, enlarge, labelled, read_video, write_gif, write_video
+    from persist_cli.output.sheet import write_sheet
+    from persist_cli.output.video import beside, enlarge, labelled, read_video, write_gif, write_video
 
     truth = parse_reference(trajectory).single().read(slice(HALF, None)).observations.rgb
     rows = [("ground truth", truth)]

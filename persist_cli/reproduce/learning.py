@@ -27,10 +27,10 @@ from persist_cli.errors import PersistError
 from persist_cli.evaluate.statistics import LEAST_UNITS, Draws, Figure, difference, mean_figure
 from persist_cli.io.files import read_json, write_json, write_text
 from persist_cli.learn.learn import FIGURES, RESULTS
+from persist_cli.output.console import say
 from persist_cli.policies.trained import find_policy, packaged_policy
 from persist_cli.reproduce.commands import run_line, run_main
 from persist_cli.reproduce.plan_file import PLAN, keep_plan, model_json
-from persist_cli.viewing.console import say
 
 SIMULATOR: Final = "simulator"
 

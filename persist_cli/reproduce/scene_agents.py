@@ -34,12 +34,12 @@ from persist_cli.data.store import Store
 from persist_cli.errors import DataError, PersistError, PluginError
 from persist_cli.evaluate.statistics import LEAST_UNITS, Draws, mean_figure
 from persist_cli.io.files import read_json, write_json, write_text
+from persist_cli.output.console import say
 from persist_cli.plugins import load_plugin
 from persist_cli.reproduce.commands import run_line, run_main
 from persist_cli.reproduce.learning import SIMULATOR, comparison, comparison_text, named
 from persist_cli.reproduce.plan_file import keep_plan, model_json
 from persist_cli.simulators.collect import CollectPlan
-from persist_cli.viewing.console import say
 
 RESULTS: Final = "agents.json"
 

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Final
 
 from persist_cli.errors import PersistError
 from persist_cli.io.files import written_aside
+from persist_cli.output.console import say
 from persist_cli.reproduce.commands import run_main
 from persist_cli.reproduce.pages import driven_chromium, served_page, split_arguments, window_size
-from persist_cli.viewing.console import say
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page

@@ -22,8 +22,8 @@ from persist_cli.errors import CheckpointError
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.memorize.memory_file import load_memory
 from persist_cli.navigation.ground_mapper import body_of, tells_body
+from persist_cli.output.console import busy, warn
 from persist_cli.rollout.world_model import Agent, WorldModel
-from persist_cli.viewing.console import busy, warn
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,11 +20,11 @@ from persist_cli.api.observations import Observations
 from persist_cli.io.files import empty_folder_aside, remove_leftovers, write_json, write_text
 from persist_cli.metrics import METRICS
 from persist_cli.metrics.metric import FrameMetric, Prediction, Setup
+from persist_cli.output.depth import DepthScale
+from persist_cli.output.map import draw_map
+from persist_cli.output.sheet import write_sheet
+from persist_cli.output.video import below, beside, enlarge, labelled, still, write_video
 from persist_cli.rollout.camera_path import Rollout, RolloutPlan
-from persist_cli.viewing.depth import DepthScale
-from persist_cli.viewing.map import draw_map
-from persist_cli.viewing.sheet import write_sheet
-from persist_cli.viewing.video import below, beside, enlarge, labelled, still, write_video
 
 Video = UInt8[Tensor, "frame height width 3"]
 LabelledVideos = Sequence[tuple[str, Video]]

@@ -20,11 +20,11 @@ from persist_cli.data.cameras import unfamiliar_view
 from persist_cli.errors import PersistError
 from persist_cli.io.files import check_folder
 from persist_cli.memorize.memory_file import add_paths, load_paths
+from persist_cli.output.console import add_task, busy, print_json, progress, say, warn
 from persist_cli.rollout.camera_path import CameraPath, Rollout, RolloutPlan, plan_camera_paths
 from persist_cli.rollout.open_world import WorldOptions, assemble_world
 from persist_cli.rollout.outputs import CARD, blocked_words, counted_words, describe, path_of, summary, write_outputs
 from persist_cli.rollout.world_model import StepResult, WorldModel
-from persist_cli.viewing.console import add_task, busy, print_json, progress, say, warn
 
 
 def run_rollout(path: Path | None, plan: RolloutPlan, out: Path, as_json: bool) -> None:

@@ -31,13 +31,13 @@ from persist_cli.data.storable import faults_of, shown
 from persist_cli.data.store import write_trajectory
 from persist_cli.errors import DataError
 from persist_cli.io.files import read_json, remove_leftovers, write_json
+from persist_cli.output.console import add_task, print_json, progress, say
 from persist_cli.plugins import check_simulator, load_plugin, make_settings, make_simulator, plugin_errors
 from persist_cli.simulators.answers import check_agent, check_scene
 from persist_cli.simulators.free_grid import clear_distance
 from persist_cli.simulators.policies import POLICIES, walk
 from persist_cli.simulators.ranges import Range
 from persist_cli.simulators.sensors import SENSORS, Look, sensed
-from persist_cli.viewing.console import add_task, print_json, progress, say
 
 PLAN_FILE = "collect.json"
 VERSION = 1

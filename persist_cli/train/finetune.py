@@ -48,6 +48,7 @@ from persist_cli.errors import PersistError, RecipeError
 from persist_cli.io.command_line import quoted
 from persist_cli.io.files import check_folder
 from persist_cli.memorize.factory import MemoryFactory
+from persist_cli.output.console import busy, say, warn
 from persist_cli.plugins import make_scene_model
 from persist_cli.policies.trained import find_policy, make_network
 from persist_cli.recipe import (
@@ -84,7 +85,6 @@ from persist_cli.train.state import load_state
 from persist_cli.train.tensor_cache import CacheSettings
 from persist_cli.train.trainer import Trainer
 from persist_cli.train.training_loop import StopSignal, TrainingLoop
-from persist_cli.viewing.console import busy, say, warn
 
 LONGEST_WAIT: Final = timedelta(hours=1)  # for a process that does not answer, as while it writes a large model
 

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from persist_cli.io.files import write_json, write_text, written_aside
-from persist_cli.viewing.console import print_table
+from persist_cli.output.console import print_table
 
 PARTS: Final = ("data", "encode", "memory", "forward", "backward", "optimizer")  # of a step, as they follow each other
 

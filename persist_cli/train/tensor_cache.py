@@ -19,7 +19,7 @@ from torch import Tensor
 
 from persist_cli.errors import CheckpointError, PersistError
 from persist_cli.io.files import ASIDE, read_tensors, remove_leftovers, write_tensors
-from persist_cli.viewing.console import say
+from persist_cli.output.console import say
 
 FORMAT: Final = 3  # of the entries; those of another format are not found
 

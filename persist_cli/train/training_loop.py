@@ -23,6 +23,7 @@ from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.checkpoints.lineage import Lineage
 from persist_cli.data.clips import DistributedBatches
 from persist_cli.errors import PersistError
+from persist_cli.output.console import add_task, progress
 from persist_cli.recipe import Recipe
 from persist_cli.train.distributed import Sharding, ZeroState, is_sharded, unflattened, uses_zero
 from persist_cli.train.log import StepLog, StepTimes
@@ -30,7 +31,6 @@ from persist_cli.train.optimizer import Opponent, make_average, make_optimizer, 
 from persist_cli.train.packing import pack, unpack
 from persist_cli.train.state import TrainingState
 from persist_cli.training_settings import TrainingSettings
-from persist_cli.viewing.console import add_task, progress
 
 Model = TypeVar("Model", bound=nn.Module)
 

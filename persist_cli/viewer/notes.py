@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from persist_cli.errors import PersistError
-from persist_cli.viewing.data_uri import data_uri
+from persist_cli.output.data_uri import data_uri
 
 BOX = "padding:0 .75em .6em;font-size:.85em;line-height:1.4;overflow-wrap:anywhere"
 

@@ -12,7 +12,7 @@ import viser
 from websockets.exceptions import ConnectionClosed
 
 from persist_cli.errors import PersistError
-from persist_cli.viewing.own_address import EVERYWHERE, bind, leads_here, names_of, same_host
+from persist_cli.io.own_address import EVERYWHERE, bind, leads_here, names_of, same_host
 
 REFUSED: Final = 1008  # code of WebSocket: a policy is violated
 MOST_BYTES: Final = 1 << 20  # of a message that a page sends

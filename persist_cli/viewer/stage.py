@@ -15,12 +15,12 @@ from persist_cli.api.cells import Box
 from persist_cli.api.ground import ground_axes
 from persist_cli.api.observations import Observations
 from persist_cli.api.tokens import MemoryTokens
+from persist_cli.output.map import ABOVE_CAMERA, PATH_COLORS
 from persist_cli.viewer.block_mesh import block_mesh
 from persist_cli.viewer.camera_view import pose_of
 from persist_cli.viewer.drawn_cells import POINT, DrawnCells, cells_of_frames, painted
 from persist_cli.viewer.level_of_detail import DetailTree
 from persist_cli.viewer.subject import MAP, TRUTH, DrawnWalk, Subject
-from persist_cli.viewing.map import ABOVE_CAMERA, PATH_COLORS
 
 Array = np.ndarray[Any, Any]
 

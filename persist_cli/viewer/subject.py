@@ -21,8 +21,8 @@ from persist_cli.editing.views import path_cameras
 from persist_cli.errors import DataError, PersistError
 from persist_cli.io.files import read_json
 from persist_cli.memorize.memory_file import load_memory, load_paths
+from persist_cli.output.video import read_video
 from persist_cli.viewer.drawn_cells import DrawnCells, cells_of_frames, cells_of_grid, cells_of_memory
-from persist_cli.viewing.video import read_video
 
 MOST_FRAMES: Final = 240  # of a walk that are read; of a longer one evenly chosen ones
 MOST_PIXELS: Final = 128  # of the shorter side of depth that becomes points, and of pictures

@@ -10,12 +10,12 @@ from typing import Any
 
 from persist_cli.errors import DataError, PersistError
 from persist_cli.io.files import check_folder
+from persist_cli.io.own_address import address_of, bind, is_loopback, leave, open_browser
 from persist_cli.memorize.memory_file import load_paths
+from persist_cli.output.console import busy, print_json, say, warn
 from persist_cli.viewer.edit_session import EditSession, default_out
 from persist_cli.viewer.imagine import Imaginer, ImagineSettings
 from persist_cli.viewer.subject import TRUTH, Subject, describe, open_subject
-from persist_cli.viewing.console import busy, print_json, say, warn
-from persist_cli.viewing.own_address import address_of, bind, is_loopback, leave, open_browser
 
 
 @dataclass(frozen=True, kw_only=True)

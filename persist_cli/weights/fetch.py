@@ -12,7 +12,7 @@ from typing import Final
 from persist_cli.errors import CheckpointError, PersistError
 from persist_cli.io.files import file_sha256, folder_aside, read_json
 from persist_cli.io.hub import cached_weight, weights_home
-from persist_cli.viewing.console import busy, print_json, print_table, say
+from persist_cli.output.console import busy, print_json, print_table, say
 from persist_cli.weights.catalog import WEIGHTS, Weight, find_weight
 from persist_cli.weights.weight_sources import DAY, find_source, from_directory, remove_downloads
 

@@ -16,7 +16,7 @@ from typing import Final, Literal
 from persist_cli.errors import PersistError
 from persist_cli.io.files import empty_folder_aside, read_json, remove_leftovers
 from persist_cli.io.hub import MODEL_FILES, hub_obstacle, weights_home
-from persist_cli.viewing.console import add_task, busy, progress
+from persist_cli.output.console import add_task, busy, progress
 from persist_cli.weights.catalog import Archive, HubRepository, Weight
 
 DOWNLOADS: Final = ".downloads"  # folder of downloaded archives beside the weights

@@ -13,7 +13,7 @@ import torch
 from torch.nn.functional import scaled_dot_product_attention
 
 from persist_cli.api.cpu_attention import attend
-from persist_cli.viewing.console import print_table
+from persist_cli.output.console import print_table
 from tests.benchmarks.timing import alternate, say_conditions
 
 CHANNELS = 64  # of a head

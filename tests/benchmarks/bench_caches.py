@@ -39,7 +39,7 @@ from persist_cli.checkpoints.load import adapter_memory, load_adapter, load_back
 from persist_cli.data.reference import sample_data
 from persist_cli.data.store import Store
 from persist_cli.memorize.factory import MemoryFactory
-from persist_cli.viewing.console import print_table
+from persist_cli.output.console import print_table
 from tests.benchmarks.timing import alternate, say_conditions
 
 UNCACHED = "none"

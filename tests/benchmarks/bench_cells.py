@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs 
 
 from persist_cli.data.store import Store, TrajectoryFile
 from persist_cli.data.written_scenes import SceneWriter
-from persist_cli.viewing.console import print_table
+from persist_cli.output.console import print_table
 
 
 def compare(file: TrajectoryFile) -> dict[str, torch.Tensor]:

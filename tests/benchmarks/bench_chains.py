@@ -32,8 +32,8 @@ from persist_cli.io.files import write_json
 from persist_cli.metrics import METRICS
 from persist_cli.metrics.fvd_pieces import fvd_of_rows, pieces
 from persist_cli.metrics.metric import FrameMetric, Prediction
-from persist_cli.viewing.console import print_table, say
-from persist_cli.viewing.sheet import write_sheet
+from persist_cli.output.console import print_table, say
+from persist_cli.output.sheet import write_sheet
 
 FIGURES = ("lpips-alex", "psnr", "sharpness", "grain")
 FRAMES = 8  # of a walk on a sheet

@@ -23,7 +23,7 @@ from persist_cli.bench.scenes.completions import Prior
 from persist_cli.bench.scenes.scene_bench import SceneBenchPlan, chosen_files, read_views, training_houses
 from persist_cli.bench.scenes.training_houses import House, nearest_houses, vote
 from persist_cli.bench.scenes.views import View
-from persist_cli.viewing.console import print_table
+from persist_cli.output.console import print_table
 
 Classes = UInt8[Tensor, "first second level"]
 

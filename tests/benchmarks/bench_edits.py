@@ -17,8 +17,8 @@ from persist_cli.api.cells import FREE, OUTSIDE, CellGrid
 from persist_cli.api.memory import FrameOfReference
 from persist_cli.api.scene_edits import Remove
 from persist_cli.data.store import Store, TrajectoryFile
+from persist_cli.output.console import print_table
 from persist_cli.plugins import make_encoder, make_memory
-from persist_cli.viewing.console import print_table
 from persist_memory.scene.grid_scene import GridScene
 
 THINGS_FROM = 7  # number of the first class of furniture in the houses' palette

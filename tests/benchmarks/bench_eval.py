@@ -16,7 +16,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
 
-from persist_cli.viewing.console import print_table, say
+from persist_cli.output.console import print_table, say
 from tests.support.micro_runs import MICRO_SETTINGS, PERSIST, run_persist_process, stage, write_walks
 
 COUNTS = (10, 100, 1000)

@@ -28,7 +28,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
 
 from persist_cli.io.files import write_json
-from persist_cli.viewing.console import say
+from persist_cli.output.console import say
 from tests.benchmarks.full_scale.measuring import device_name, peak_flops, release
 from tests.benchmarks.full_scale.rows import Row, print_rows
 from tests.benchmarks.full_scale.sampling import clip_rows, codec_rows, map_rows

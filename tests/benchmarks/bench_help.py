@@ -12,7 +12,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs as a script
 
-from persist_cli.viewing.console import print_table
+from persist_cli.output.console import print_table
 from tests.benchmarks.timing import alternate, say_conditions
 
 HELLO = """

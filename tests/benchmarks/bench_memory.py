@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs 
 
 from persist_cli.api.memory import Memory
 from persist_cli.api.observations import Observations
-from persist_cli.viewing.console import print_table
+from persist_cli.output.console import print_table
 from persist_memory.grid.storage import pack
 from tests.support.room_views import empty_memory, observe
 from tests.support.rooms import look, walk

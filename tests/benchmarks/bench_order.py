@@ -27,7 +27,7 @@ from persist_cli.api.checkpoint import find_checkpoint, reference_checkpoint
 from persist_cli.api.memory import Memory
 from persist_cli.checkpoints.load import adapter_memory, load_backbone
 from persist_cli.evaluate.statistics import Draws, mean_figure
-from persist_cli.viewing.console import print_table, say
+from persist_cli.output.console import print_table, say
 from tests.benchmarks.bench_rendered import Example, Model, examples, measure
 
 MEMORIES = ("none", "map2d", "snapshots", "voxel")

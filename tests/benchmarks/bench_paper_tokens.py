@@ -20,8 +20,8 @@ from persist_cli.api.cameras import invert_rigid
 from persist_cli.api.geometry import transform
 from persist_cli.data.reference import parse_reference
 from persist_cli.memorize.factory import MemoryFactory
+from persist_cli.output.console import print_table
 from persist_cli.recipe import make_recipe, read_recipe
-from persist_cli.viewing.console import print_table
 
 FRAMES, CLIP, FREQUENCIES, ALL = 48, 9, 10, 100_000
 

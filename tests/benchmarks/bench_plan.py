@@ -38,13 +38,13 @@ from persist_cli.data.store import Store, TrajectoryFile
 from persist_cli.io.files import write_json
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.navigation.ground_mapper import body_of
+from persist_cli.output.console import print_table, say, watched
 from persist_cli.planning.futures import WorldFutures
 from persist_cli.planning.planners import draw
 from persist_cli.planning.true_futures import true_futures
 from persist_cli.plugins import make_cost
 from persist_cli.rollout.surroundings import Surroundings
 from persist_cli.rollout.world_model import Agent, WorldModel
-from persist_cli.viewing.console import print_table, say, watched
 
 AHEAD = 8  # frames from the start to the goal, along the trajectory
 

@@ -28,11 +28,11 @@ import numpy as np
 import torch
 
 from persist_cli.api.memory import Memory
+from persist_cli.output.console import print_json, print_table, say
 from persist_cli.play import open_play
 from persist_cli.play.play import Play
 from persist_cli.play.settings import PlaySettings
 from persist_cli.play.start import SAMPLE_FRAMES, SAMPLE_START, StartOptions
-from persist_cli.viewing.console import print_json, print_table, say
 
 KEYS: Final = ("forward", "left", "right", "backward")
 WEIGHTS: Final = (5, 2, 2, 1)

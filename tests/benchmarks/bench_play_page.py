@@ -25,9 +25,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import psutil
 
+from persist_cli.output.console import print_table, say
 from persist_cli.reproduce.pages import CHROMIUM, ServedPage, driven_chromium, served_page, split_arguments
 from persist_cli.reproduce.play_picture import READY, frame_number
-from persist_cli.viewing.console import print_table, say
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page

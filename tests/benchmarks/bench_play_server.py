@@ -23,8 +23,8 @@ from pathlib import Path
 import numpy as np
 import psutil
 
+from persist_cli.output.console import print_table, say
 from persist_cli.reproduce.pages import ServedPage, served_page
-from persist_cli.viewing.console import print_table, say
 from tests.support.play_pages import Page, open_page
 
 KEYS = ("left", "right")  # which are never blocked

@@ -30,10 +30,10 @@ from persist_cli.api.policy_network import PolicySample, PolicySamples
 from persist_cli.data.policy_samples import PolicySampleDataset, SampleFrames
 from persist_cli.data.reference import sample_data
 from persist_cli.io.files import write_json
+from persist_cli.output.console import print_table, say
 from persist_cli.policies.nomad.network import NomadNetwork
 from persist_cli.policies.nomad.policy import SURE
 from persist_cli.policies.trained import find_policy, packaged_policy
-from persist_cli.viewing.console import print_table, say
 
 BATCH = 50
 FARTHEST = 5.0  # metres to a goal whose place is asked for

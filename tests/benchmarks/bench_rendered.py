@@ -41,8 +41,8 @@ from persist_cli.evaluate.rows.warp import Surface, warp
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.metrics import METRICS
 from persist_cli.metrics.metric import Prediction
+from persist_cli.output.console import print_table, say
 from persist_cli.recipe import MemoryConfig
-from persist_cli.viewing.console import print_table, say
 
 FRESH = "a fresh adapter"
 

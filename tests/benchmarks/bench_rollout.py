@@ -22,10 +22,10 @@ from persist_cli.api.actions import walking_actions
 from persist_cli.api.backbone import Backbone, Sampling
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.memorize.factory import MemoryFactory
+from persist_cli.output.console import print_table
 from persist_cli.plugins import make_backbone
 from persist_cli.recipe import MemoryConfig
 from persist_cli.rollout.world_model import Agent, WorldModel
-from persist_cli.viewing.console import print_table
 from tests.benchmarks.timing import Times, alternate, say_conditions
 from tests.support.room_views import MEMORIES, observe
 from tests.support.rooms import UP, Room, look

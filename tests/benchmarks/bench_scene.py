@@ -20,9 +20,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs 
 
 from persist_cli.api.scene_model import SceneModel, SceneSamples
 from persist_cli.api.stages import SCENE_STAGES, Stage
+from persist_cli.output.console import print_table
 from persist_cli.plugins import make_scene_model
 from persist_cli.recipe import make_recipe, read_recipe
-from persist_cli.viewing.console import print_table
 from tests.benchmarks.timing import alternate, say_conditions
 from tests.support.random_scenes import PALETTE, random_sample
 

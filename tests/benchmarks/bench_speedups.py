@@ -28,12 +28,12 @@ from persist_cli.data.clips import ClipDataset, ClipPlan, ClipSample
 from persist_cli.io.hub import cached_weight
 from persist_cli.memorize.factory import MemoryFactory, with_memory
 from persist_cli.memorize.kept_features import KeptFeatures
+from persist_cli.output.console import print_table
 from persist_cli.plugins import make_backbone
 from persist_cli.policies.nomad.efficientnet import EfficientNet
 from persist_cli.policies.trained import packaged_policy
 from persist_cli.recipe import make_recipe, read_recipe
 from persist_cli.train.tensor_cache import CacheSettings, TensorCache
-from persist_cli.viewing.console import print_table
 from tests.benchmarks.timing import alternate, say_conditions
 from tests.support.room_views import write_room_walks
 

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 
 from persist_cli.cli.options import SPINS
-from persist_cli.viewing.console import print_table, say
+from persist_cli.output.console import print_table, say
 from tests.benchmarks.timing import alternate
 
 DEFAULT = "default"

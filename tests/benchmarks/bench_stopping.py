@@ -39,10 +39,10 @@ from persist_cli.episodes.run_episode import ClosedLoop, LoopSettings, Trace
 from persist_cli.episodes.stop_rules import view_costs
 from persist_cli.episodes.true_scene import TrueScene
 from persist_cli.learn.evaluation import ROW
+from persist_cli.output.console import print_table, say, watched
 from persist_cli.plugins import make_cost, make_simulator
 from persist_cli.policies.nomad.policy import STOP, NomadPolicy
 from persist_cli.policies.open_policy import open_policy
-from persist_cli.viewing.console import print_table, say, watched
 
 COSTS = (0.05, 0.1, 0.12, 0.15, 0.17, 0.2, 0.25, 0.3)  # LPIPS
 DISTANCES = (1.5, 2, 3, 4, 5, 6, 8)  # spacings of frames

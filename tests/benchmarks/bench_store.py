@@ -20,7 +20,7 @@ from persist_cli.api.observations import Observations
 from persist_cli.data.clips import ClipDataset, ClipPlan
 from persist_cli.data.images import decode_depth, decode_rgb, encode_depth, encode_rgb
 from persist_cli.data.store import Store
-from persist_cli.viewing.console import print_table
+from persist_cli.output.console import print_table
 from tests.benchmarks.timing import Times, alternate, say_conditions
 from tests.support.room_views import write_room_walks
 

@@ -21,11 +21,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # so that it runs 
 
 from persist_cli.api.backbone import Clips
 from persist_cli.memorize.factory import MemoryFactory
+from persist_cli.output.console import print_table
 from persist_cli.recipe import apply_overrides, make_recipe, read_recipe
 from persist_cli.train.finetune import prepare_backbone
 from persist_cli.train.tensor_cache import CacheSettings
 from persist_cli.train.trainer import Trainer
-from persist_cli.viewing.console import print_table
 from tests.benchmarks.timing import Times, alternate, say_conditions
 from tests.support.room_views import MEMORIES, write_room_walks
 

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from persist_cli.api.memory import Memory
+from persist_cli.output.console import print_table
 from persist_cli.viewer.block_mesh import block_mesh
 from persist_cli.viewer.drawn_cells import cells_of_memory
 from persist_cli.viewer.edit_session import EditSession
 from persist_cli.viewer.level_of_detail import DetailTree
-from persist_cli.viewing.console import print_table
 from tests.benchmarks.bench_memory import building
 
 INSIDE = 1.5  # metres from the middle of the map to the place from which it is looked at

@@ -36,8 +36,8 @@ from persist_cli.data.clips import interactions_of
 from persist_cli.data.reference import sample_data
 from persist_cli.data.store import Store
 from persist_cli.memorize.factory import MemoryFactory
+from persist_cli.output.console import print_table
 from persist_cli.rollout.world_model import Agent, WorldModel
-from persist_cli.viewing.console import print_table
 from tests.benchmarks.timing import say_conditions
 
 OUT = 16  # frames of the unseen way out, and as many back

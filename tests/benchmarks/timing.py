@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from persist_cli.viewing.console import say
+from persist_cli.output.console import say
 
 
 @dataclass(frozen=True)

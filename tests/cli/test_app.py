@@ -109,7 +109,7 @@ def test_a_file_in_the_place_of_an_output_folder_is_reported_before_any_work(per
 
 
 def test_sigterm_ends_a_command_in_one_line_with_the_exit_code_of_that_signal(persist, monkeypatch):
-    monkeypatch.setattr("persist_cli.viewing.listings.show_recipes", lambda _: signal.raise_signal(signal.SIGTERM))
+    monkeypatch.setattr("persist_cli.output.listings.show_recipes", lambda _: signal.raise_signal(signal.SIGTERM))
     before = signal.getsignal(signal.SIGTERM)
     ended = persist("recipes")
     assert (ended.code, ended.err) == (
@@ -140,7 +140,7 @@ def test_what_the_system_refuses_ends_a_command_in_one_line(persist, monkeypatch
     def fail(_: bool) -> None:
         raise error
 
-    monkeypatch.setattr("persist_cli.viewing.listings.show_recipes", fail)
+    monkeypatch.setattr("persist_cli.output.listings.show_recipes", fail)
     ended = persist("recipes")
     assert (ended.code, ended.err) == (1, f"error: {line}\n")
 
@@ -149,7 +149,7 @@ def test_a_reader_that_has_gone_ends_a_command_without_a_word(persist, monkeypat
     def fail(_: bool) -> None:
         raise BrokenPipeError(errno.EPIPE, "Broken pipe")
 
-    monkeypatch.setattr("persist_cli.viewing.listings.show_recipes", fail)
+    monkeypatch.setattr("persist_cli.output.listings.show_recipes", fail)
     ended = persist("recipes")
     assert (ended.code, ended.err) == (1, "")
 

@@ -18,7 +18,7 @@ from persist_cli.data.reference import parse_reference
 from persist_cli.data.store import Store
 from persist_cli.memorize.build import walking_words
 from persist_cli.memorize.memory_file import load_memory, load_paths
-from persist_cli.viewing.map import draw_map
+from persist_cli.output.map import draw_map
 from tests.memorize.test_memorize import failure, memorize, succeed
 from tests.support.cell_rooms import FORM
 from tests.support.micro_scenes import micro_model

@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from persist_cli.api.ground import ground_axes
-from persist_cli.viewing.video import read_video
+from persist_cli.output.video import read_video
 from tests.support.damage import write_huge_image
 from tests.support.micro_runs import SIZE
 from tests.support.packages import install
@@ -63,7 +63,7 @@ def test_a_seed_gives_the_same_plan_with_or_without_a_table(plan, tmp_path):
 
 def test_a_log_shows_the_best_cost_after_each_round(plan, monkeypatch):
     for seconds in ("FIRST_LINE", "LINE_EVERY"):
-        monkeypatch.setattr(f"persist_cli.viewing.console.{seconds}", 0.0)  # every line is due
+        monkeypatch.setattr(f"persist_cli.output.console.{seconds}", 0.0)  # every line is due
     result = plan("--cost", "distance", "--json")
     assert result.code == 0, result.err
     for number, one in enumerate(json.loads(result.out)["rounds"], 1):

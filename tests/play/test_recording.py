@@ -9,11 +9,11 @@ import torch
 
 from persist_cli.data.store import Store
 from persist_cli.errors import PersistError
+from persist_cli.output.video import read_video
 from persist_cli.play import recording
 from persist_cli.play.open_play import PlayOptions, open_play
 from persist_cli.play.settings import PlaySettings
 from persist_cli.play.start import StartOptions
-from persist_cli.viewing.video import read_video
 from tests.support.micro_runs import BACK, OUT, SIZE
 
 

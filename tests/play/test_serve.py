@@ -10,7 +10,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 
 from persist_cli.data.store import Store
-from persist_cli.viewing.own_address import address_of, bind, names_of
+from persist_cli.io.own_address import address_of, bind, names_of
 from tests.support.play_pages import open_page
 from tests.support.processes import start_persist, wait_until
 

@@ -9,10 +9,10 @@ import pytest
 from websockets.exceptions import InvalidStatus
 
 from persist_cli.errors import PersistError
+from persist_cli.io.own_address import bind, same_host
 from persist_cli.play.recordings import Download
 from persist_cli.play.server import OwnAddress
 from persist_cli.play.walking_page import walking_page
-from persist_cli.viewing.own_address import bind, same_host
 from tests.support.micro_plays import micro_walks
 from tests.support.play_pages import serving
 

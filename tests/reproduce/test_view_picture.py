@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 from persist_cli.errors import PersistError
+from persist_cli.io.own_address import address_of
 from persist_cli.reproduce import view_picture
 from persist_cli.reproduce.pages import CHROMIUM
 from persist_cli.reproduce.view_picture import take_picture
@@ -16,7 +17,6 @@ from persist_cli.viewer.page import Page
 from persist_cli.viewer.page_server import page_server
 from persist_cli.viewer.stage import Look
 from persist_cli.viewer.subject import POINTS, open_subject
-from persist_cli.viewing.own_address import address_of
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
 

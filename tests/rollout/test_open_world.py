@@ -12,8 +12,8 @@ from persist_cli.api.observations import Frame
 from persist_cli.data.store import Store, write_trajectory
 from persist_cli.errors import CheckpointError, PersistError, PluginError
 from persist_cli.memorize.memory_file import load_memory
+from persist_cli.output.video import read_video
 from persist_cli.rollout.open_world import open_world
-from persist_cli.viewing.video import read_video
 from tests.support.micro_runs import SIZE
 from tests.support.room_views import empty_memory
 

@@ -12,11 +12,11 @@ from persist_cli.api.observations import Origin
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError
 from persist_cli.memorize.memory_file import load_memory, load_paths
+from persist_cli.output.video import read_video
 from persist_cli.plugins import make_encoder, make_memory
 from persist_cli.rollout.camera_path import path_of_trajectory
 from persist_cli.rollout.outputs import quaternion
 from persist_cli.rollout.world_model import Agent, WorldModel
-from persist_cli.viewing.video import read_video
 from tests.support.micro_runs import SIZE
 
 
@@ -198,8 +198,8 @@ def test_memory_options_that_cannot_work_are_refused_in_one_line(persist, walks,
 
 
 def test_each_denoising_step_of_a_rollout_counts_in_its_progress(persist, voxel, walks, tmp_path, monkeypatch):
-    monkeypatch.setattr("persist_cli.viewing.console.FIRST_LINE", 0.0)
-    monkeypatch.setattr("persist_cli.viewing.console.LINE_EVERY", 0.0)
+    monkeypatch.setattr("persist_cli.output.console.FIRST_LINE", 0.0)
+    monkeypatch.setattr("persist_cli.output.console.LINE_EVERY", 0.0)
     options = ("--actions", "forward*12", "--no-body")  # two clips, each of two steps
     ended = roll(persist, voxel, walks, tmp_path, *options)
     lines = [line for line in ended.err.splitlines() if line.startswith("rollout: ")]

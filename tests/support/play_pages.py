@@ -13,13 +13,13 @@ from typing import Any
 
 from websockets.sync.client import ClientConnection, connect
 
+from persist_cli.io.own_address import bind
 from persist_cli.play.messages import LENGTH
 from persist_cli.play.play import Play
 from persist_cli.play.recordings import Recordings
 from persist_cli.play.server import Server, make_app
 from persist_cli.play.sessions import Limits, Sessions
 from persist_cli.play.walking_page import walking_page
-from persist_cli.viewing.own_address import bind
 
 PATIENCE = 60.0  # seconds in which a busy machine answers
 

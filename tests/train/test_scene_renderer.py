@@ -13,10 +13,10 @@ import torch
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.checkpoints.load import adapter_memory
 from persist_cli.checkpoints.scene_models import find_scene_model, save_scene_model
+from persist_cli.output.video import read_video
 from persist_cli.plugins import make_scene_model
 from persist_cli.recipe import make_recipe, read_recipe
 from persist_cli.simulators.house_cells import FORM as HOUSES
-from persist_cli.viewing.video import read_video
 from tests.support.cell_houses import FORM
 from tests.support.cell_walks import write_with_cells
 from tests.support.damage import without_sums

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from persist_cli.io.own_address import address_of
 from persist_cli.memorize.memory_file import load_memory, load_paths
 from persist_cli.reproduce.pages import CHROMIUM, driven_chromium
 from persist_cli.reproduce.view_picture import SOFTWARE_3D
@@ -23,7 +24,6 @@ from persist_cli.viewer.page import Page
 from persist_cli.viewer.page_server import page_server
 from persist_cli.viewer.stage import Look, Stage
 from persist_cli.viewer.subject import MAP, POINTS, TRUTH, open_subject
-from persist_cli.viewing.own_address import address_of
 from tests.support.browser import watched
 
 if TYPE_CHECKING:

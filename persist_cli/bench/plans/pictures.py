@@ -15,8 +15,8 @@ from persist_cli.bench.plans.results import groups
 from persist_cli.episodes.episodes import Episode
 from persist_cli.episodes.rows import PlanningRow
 from persist_cli.episodes.true_scene import TrueScene
-from persist_cli.viewing.data_uri import data_uri, png_uri
-from persist_cli.viewing.map import draw_map
+from persist_cli.output.data_uri import data_uri, png_uri
+from persist_cli.output.map import draw_map
 
 MOST_ROWS: Final = 4  # whose ways a map shows beside the shortest one, since it has five colours
 

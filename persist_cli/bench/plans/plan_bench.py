@@ -34,12 +34,12 @@ from persist_cli.evaluate.processes import Processes
 from persist_cli.evaluate.provenance import checkpoint_json
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.metrics.src import chosen_encoder
+from persist_cli.output.console import add_task, busy, progress
 from persist_cli.planning.planners import check_horizon
 from persist_cli.plugins import check_simulator, make_cost, make_simulator
 from persist_cli.policies.open_policy import acting_settings, open_policy
 from persist_cli.policies.trained import TrainedPolicy, find_policy, packaged_policy
 from persist_cli.simulators.collect import CollectPlan
-from persist_cli.viewing.console import add_task, busy, progress
 
 LOOPS: Final = ("closed", "open")
 SCENES: Final = "0:24"  # test houses in which episodes are drawn

@@ -12,7 +12,7 @@ from persist_cli.bench.plans.results import results_json
 from persist_cli.bench.plans.tables import print_results, tables_text
 from persist_cli.evaluate.processes import Processes
 from persist_cli.io.files import check_folder, write_json, write_text
-from persist_cli.viewing.console import busy, print_json, say
+from persist_cli.output.console import busy, print_json, say
 
 RESULTS: Final = "metrics.json"
 

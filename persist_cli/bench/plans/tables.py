@@ -8,7 +8,7 @@ from typing import Any, Final
 from persist_cli.bench.figure_text import markdown_table
 from persist_cli.bench.plans.plan_bench import LOOPS
 from persist_cli.bench.plans.results import COLUMNS
-from persist_cli.viewing.console import print_table, say
+from persist_cli.output.console import print_table, say
 
 SHORT: Final = (
     "success",

@@ -21,7 +21,7 @@ from persist_cli.bench.scenes.scene_bench import SceneBench
 from persist_cli.bench.scenes.training_houses import House
 from persist_cli.bench.scenes.views import Region, View, sampled, true_region
 from persist_cli.evaluate.statistics import Draws, Figure, difference, mean_figure, number
-from persist_cli.viewing.console import add_task, progress
+from persist_cli.output.console import add_task, progress
 
 PART: Final = "completion"
 

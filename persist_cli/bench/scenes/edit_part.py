@@ -31,7 +31,7 @@ from persist_cli.data.reference import parse_reference
 from persist_cli.editing.locality import edit_locality, edited_pixels
 from persist_cli.errors import DataError
 from persist_cli.evaluate.statistics import Draws, mean_figure
-from persist_cli.viewing.console import add_task, progress, warn
+from persist_cli.output.console import add_task, progress, warn
 
 PART: Final = "edits"
 

@@ -30,7 +30,7 @@ from persist_cli.data.scene_samples import PICK_UP
 from persist_cli.data.store import TrajectoryFile
 from persist_cli.evaluate.statistics import Draws, mean_figure
 from persist_cli.navigation.ground_mapper import body_of
-from persist_cli.viewing.console import add_task, progress, warn
+from persist_cli.output.console import add_task, progress, warn
 
 PART: Final = "evolution"
 

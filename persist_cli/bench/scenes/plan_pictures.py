@@ -15,7 +15,7 @@ from persist_cli.api.cells import OUTSIDE, SOLID, is_solid
 from persist_cli.bench.scenes.completion_part import kept_samples
 from persist_cli.bench.scenes.scene_bench import SceneBench
 from persist_cli.bench.scenes.views import View
-from persist_cli.viewing.data_uri import data_uri
+from persist_cli.output.data_uri import data_uri
 
 MOST_VIEWS: Final = 12
 

@@ -30,8 +30,8 @@ from persist_cli.metrics.fvd_pieces import fvd_of_rows, pieces
 from persist_cli.metrics.lpips import ALEX, LpipsAlex, perceptual_distance, tensor_shapes
 from persist_cli.metrics.networks import missing_weights, network_weights, run_network
 from persist_cli.metrics.sharpness import LAPLACIAN, energy
+from persist_cli.output.console import add_task, progress
 from persist_cli.rollout.world_model import WorldModel
-from persist_cli.viewing.console import add_task, progress
 
 PART: Final = "return"
 

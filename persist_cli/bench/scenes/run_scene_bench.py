@@ -20,7 +20,7 @@ from persist_cli.evaluate.provenance import environment
 from persist_cli.evaluate.statistics import LEAST_UNITS, RESAMPLES
 from persist_cli.io.command_line import running_command
 from persist_cli.io.files import check_folder, write_json, write_text
-from persist_cli.viewing.console import print_json, say
+from persist_cli.output.console import print_json, say
 
 RESULTS: Final = "metrics.json"
 

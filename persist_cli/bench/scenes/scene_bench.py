@@ -42,8 +42,8 @@ from persist_cli.io.files import file_sha256
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.memorize.memory_config import plugin_settings, scene_config
 from persist_cli.navigation.ground_mapper import body_of
+from persist_cli.output.console import add_task, progress
 from persist_cli.recipe import MemoryConfig
-from persist_cli.viewing.console import add_task, progress
 
 WIDEST: Final = 50.0  # metres around a camera that are measured at most
 

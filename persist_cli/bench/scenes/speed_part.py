@@ -11,7 +11,7 @@ from persist_cli.bench.figure_text import FigureColumn
 from persist_cli.bench.scenes.scene_bench import SceneBench
 from persist_cli.bench.scenes.views import Region, View
 from persist_cli.bench.scenes.walk_part import walked
-from persist_cli.viewing.console import add_task, progress
+from persist_cli.output.console import add_task, progress
 
 PART: Final = "speed"
 

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from persist_cli.bench.figure_text import FigureColumn, markdown_table
 from persist_cli.bench.scenes import completion_part, edit_part, evolution_part, return_part, speed_part, walk_part
-from persist_cli.viewing.console import print_table, say
+from persist_cli.output.console import print_table, say
 
 SHORT: Final = ("miou", "structure", "iou", "doors", "leading", "open", "disagreement", "seconds")
 

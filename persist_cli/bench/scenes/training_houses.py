@@ -14,7 +14,7 @@ from persist_cli.api.cells import CellForm, CellGrid, is_solid
 from persist_cli.bench.scenes.views import Region, View, same_form, true_region
 from persist_cli.data.store import Store, TrajectoryFile
 from persist_cli.io.files import file_sha256
-from persist_cli.viewing.console import add_task, progress
+from persist_cli.output.console import add_task, progress
 
 AT_ONCE = 16  # views that are compared with a house together
 POSES = 8  # of each training house that say how often a cell is what

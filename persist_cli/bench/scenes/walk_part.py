@@ -23,8 +23,8 @@ from persist_cli.bench.scenes.connectedness import may_step
 from persist_cli.bench.scenes.scene_bench import SceneBench
 from persist_cli.bench.scenes.views import View
 from persist_cli.evaluate.statistics import Draws, mean_figure
+from persist_cli.output.console import add_task, progress
 from persist_cli.policies.simple import gait
-from persist_cli.viewing.console import add_task, progress
 
 PART: Final = "walk"
 

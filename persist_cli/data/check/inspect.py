@@ -26,7 +26,7 @@ from persist_cli.data.check.reprojection import choose_pairs
 from persist_cli.data.importers.gravity import Direction, up_text
 from persist_cli.data.reference import Reference, parse_reference
 from persist_cli.data.store import TrajectoryFile
-from persist_cli.viewing.console import add_task, print_json, print_table, progress, say, warn
+from persist_cli.output.console import add_task, print_json, print_table, progress, say, warn
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,8 @@ from persist_cli.data.store_header import schema
 from persist_cli.errors import DataError
 from persist_cli.io.command_line import quoted
 from persist_cli.io.files import check_folder, remove_leftovers
+from persist_cli.output.console import add_task, print_json, print_table, progress, say, warn
 from persist_cli.plugins import make_importer
-from persist_cli.viewing.console import add_task, print_json, print_table, progress, say, warn
 
 MOST_CAUSES = 3  # that are printed for a trajectory
 ABANDONED = 600.0  # seconds without a change after which what an import wrote is no longer being written

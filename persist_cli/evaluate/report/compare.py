@@ -129,7 +129,7 @@ def run_compare(a: Path, b: Path, json: bool, out: Path | None) -> None:
     """
 
     from persist_cli.io.files import write_json, write_text
-    from persist_cli.viewing.console import OUT, print_json, print_table, say
+    from persist_cli.output.console import OUT, print_json, print_table, say
 
     comparison = compare_runs(a, b)
     if out is not None:

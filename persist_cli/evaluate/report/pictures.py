@@ -12,10 +12,10 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from persist_cli.viewing.console import watched
-from persist_cli.viewing.depth import DepthScale
-from persist_cli.viewing.sheet import write_sheet
-from persist_cli.viewing.video import SMALLEST, below, beside, enlarge, labelled, write_video
+from persist_cli.output.console import watched
+from persist_cli.output.depth import DepthScale
+from persist_cli.output.sheet import write_sheet
+from persist_cli.output.video import SMALLEST, below, beside, enlarge, labelled, write_video
 
 SHEET_FRAMES = 9  # of a clip on a contact sheet, so that they are large enough to look at on a page
 

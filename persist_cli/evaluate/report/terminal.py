@@ -22,7 +22,7 @@ from persist_cli.evaluate.report.remarks import (
 )
 from persist_cli.evaluate.report.result_file import EvalResults, check_results
 from persist_cli.evaluate.report.tables import CellView, CompactTable, compact_tables
-from persist_cli.viewing.console import BORDER, OUT, print_table, say
+from persist_cli.output.console import BORDER, OUT, print_table, say
 
 NAME_WIDTH = 28  # characters of a row's name before it goes on in the next line
 

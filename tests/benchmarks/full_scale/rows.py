@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from persist_cli.viewing.console import print_table
+from persist_cli.output.console import print_table
 from tests.benchmarks.full_scale.measuring import Timing
 
 COLUMNS = (

@@ -16,8 +16,8 @@ from persist_cli.evaluate.report.curves import nice_ticks, plots, row_styles
 from persist_cli.evaluate.report.page import write_report
 from persist_cli.evaluate.report.pictures import ClipPicture, Pictures, RowPictures, side_by_side
 from persist_cli.evaluate.report.result_file import check_results
-from persist_cli.viewing.sheet import label_font
-from persist_cli.viewing.video import read_video
+from persist_cli.output.sheet import label_font
+from persist_cli.output.video import read_video
 from tests.support.example_results import ROWS, example_pictures, example_results
 
 

@@ -22,7 +22,7 @@ def heads(width, results=None):
 def printed(monkeypatch, results, width=80):
     """What a terminal of that width shows."""
     console = Console(file=StringIO(), width=width)
-    monkeypatch.setattr("persist_cli.viewing.console.OUT", console)
+    monkeypatch.setattr("persist_cli.output.console.OUT", console)
     monkeypatch.setattr(terminal, "OUT", console)
     print_results(results)
     return console.file.getvalue()

@@ -2,7 +2,7 @@
 
 import torch
 
-from persist_cli.viewing.depth import BAR, DepthScale
+from persist_cli.output.depth import BAR, DepthScale
 
 NEAR, MIDDLE, FAR = (torch.full((1, 4, 4), metres) for metres in (1.0, 2.0, 3.0))
 

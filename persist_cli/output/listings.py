@@ -6,9 +6,9 @@ from collections import Counter
 from collections.abc import Sequence
 
 from persist_cli.errors import PluginError
+from persist_cli.output.console import print_json, print_table, say
 from persist_cli.plugins import KINDS, Plugin, first_line, import_plugin, list_plugins
 from persist_cli.recipe import make_recipe, read_recipe, recipe_names
-from persist_cli.viewing.console import print_json, print_table, say
 
 
 def show_plugins(json: bool) -> None:

@@ -12,9 +12,9 @@ import yaml
 from persist_backbones.adapters.forms import FORMS
 from persist_cli.api.stages import Lora
 from persist_cli.io.setting_docs import Setting, meanings_in, settings_of
+from persist_cli.output.recipe_page import recipe_entries, recipe_yaml
 from persist_cli.plugins import KINDS, list_plugins, load_plugin
 from persist_cli.recipe import OF_A_BACKBONE, Recipe, make_recipe, read_recipe, recipe_names, to_plain
-from persist_cli.viewing.recipe_page import recipe_entries, recipe_yaml
 
 OF_PLUGINS = [
     load_plugin(kind, plugin.name).settings_type

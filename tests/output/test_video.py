@@ -7,7 +7,7 @@ import torch
 from PIL import Image
 
 from persist_cli.errors import DataError
-from persist_cli.viewing.video import beside, enlarge, labelled, read_video, write_gif, write_video
+from persist_cli.output.video import beside, enlarge, labelled, read_video, write_gif, write_video
 
 RAMP = (torch.linspace(0, 255, 64)[None, None, :, None] * torch.linspace(0.5, 1, 5)[:, None, None, None]).expand(
     5, 64, 64, 3

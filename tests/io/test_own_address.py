@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-OPEN = "from persist_cli.viewing.own_address import open_browser; open_browser('http://127.0.0.1:8420/')"
+OPEN = "from persist_cli.io.own_address import open_browser; open_browser('http://127.0.0.1:8420/')"
 
 
 def open_with(programs: Path, **display: str) -> subprocess.CompletedProcess[str]:

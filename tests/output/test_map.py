@@ -11,7 +11,7 @@ from PIL import Image
 from persist_cli.api.cells import CellOrigin
 from persist_cli.api.ground import ground_axes
 from persist_cli.api.memory import MapPoints
-from persist_cli.viewing.map import DrawnCandidate, draw_before_and_after, draw_candidates, draw_map, paint
+from persist_cli.output.map import DrawnCandidate, draw_before_and_after, draw_candidates, draw_map, paint
 from tests.support.room_views import room_walk, written_memory
 from tests.support.rooms import UP
 

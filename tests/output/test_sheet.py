@@ -5,8 +5,8 @@ import pytest
 import torch
 from PIL import Image
 
-from persist_cli.viewing.depth import DepthScale
-from persist_cli.viewing.sheet import CELL, GAP, HEADER, write_sheet
+from persist_cli.output.depth import DepthScale
+from persist_cli.output.sheet import CELL, GAP, HEADER, write_sheet
 
 GRAY = torch.arange(0, 250, 10, dtype=torch.uint8)[:, None, None, None].expand(25, 8, 8, 3)
 

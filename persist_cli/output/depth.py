@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw
 from torch import Tensor
 
-from persist_cli.viewing.sheet import label_font
+from persist_cli.output.sheet import label_font
 
 COLORS = "turbo_r"  # of matplotlib: near is dark red, far dark blue
 OUTLIERS = 0.02  # part of the pixels that may be nearer than the scale's near end, and farther than its far end

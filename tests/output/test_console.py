@@ -11,8 +11,8 @@ import pytest
 from rich.console import Console
 
 from persist_cli.io.files import write_json
-from persist_cli.viewing import console
-from persist_cli.viewing.console import (
+from persist_cli.output import console
+from persist_cli.output.console import (
     ProgressLines,
     add_task,
     busy,
@@ -153,7 +153,7 @@ def test_of_several_processes_only_the_main_one_speaks(capsys, monkeypatch):
 
 def test_a_line_is_in_the_file_before_the_command_ends(tmp_path):
     script = (
-        "import os; from persist_cli.viewing import console; console.FIRST_LINE = 0.0\n"
+        "import os; from persist_cli.output import console; console.FIRST_LINE = 0.0\n"
         "list(console.watched('ab', 'frames', 'frames')); os._exit(0)  # which flushes nothing"
     )
     with (tmp_path / "log").open("w") as log:

@@ -13,6 +13,7 @@ import yaml
 from persist_cli.api.stages import Stage
 from persist_cli.io.setting_docs import Setting, settings_of
 from persist_cli.io.settings import parse_settings
+from persist_cli.output.console import busy, print_json, say
 from persist_cli.plugins import load_plugin, network_type
 from persist_cli.recipe import (
     ALONE,
@@ -25,7 +26,6 @@ from persist_cli.recipe import (
     recipe_comment,
     to_plain,
 )
-from persist_cli.viewing.console import busy, print_json, say
 
 WIDTH: Final = 80  # columns of a comment
 

@@ -40,7 +40,7 @@ def labelled(video: UInt8[Tensor, "frame height width 3"], label: str) -> UInt8[
     """Return the video under a white strip with a label."""
     from PIL import Image, ImageDraw
 
-    from persist_cli.viewing.sheet import label_font
+    from persist_cli.output.sheet import label_font
 
     strip = Image.new("RGB", (video.shape[2], STRIP), "white")
     ImageDraw.Draw(strip).text((4, 2), label, fill="black", font=label_font())
