@@ -161,13 +161,8 @@ class ShallowCopies(StepCopies):
     def _traced(self, model: Backbone, recipe: Recipe, kind: StepKind) -> Iterator[tuple[Backbone, LiveBytes]]:
         """Within the block there is a fake copy of the model, as the recipe trains it, and a count of its bytes."""
         backbone = copy.deepcopy(model)
-        settings = dataclasses.replace(recipe.training, compile=False)
         with fake_tensors():
-            _fill_with_fakes(backbone)
-            parameters = backbone.trained_parameters(recipe.stage)
-            if recipe.distill is not None:
-                backbone.distill(recipe.distill, backbone, backbone)  # whose copies would compute the same
-            backbone.apply_memory_savings(recipe.stage, requested_savings(settings, torch.device("cpu")))
+            parameters = _begin(backbone, recipe)
             if kind.sharded:
                 _halve(backbone)
             with _counted(backbone, parameters, kind, recipe) as live:
@@ -178,9 +173,18 @@ def check_savings(model: Backbone, recipe: Recipe) -> None:
     """Raise ``PersistError`` when a model without weights does not support a saving that its recipe asks for."""
     backbone = copy.deepcopy(model)
     with fake_tensors():
-        _fill_with_fakes(backbone)
-        backbone.trained_parameters(recipe.stage)
-        backbone.apply_memory_savings(recipe.stage, requested_savings(recipe.training, torch.device("cpu")))
+        _begin(backbone, recipe)
+
+
+def _begin(backbone: Backbone, recipe: Recipe) -> dict[str, nn.Parameter]:
+    """Prepare a model on the meta device as the recipe trains it, with fake tensors; return what is trained."""
+    _fill_with_fakes(backbone)
+    parameters = backbone.trained_parameters(recipe.stage)
+    if recipe.distill is not None:
+        backbone.distill(recipe.distill, backbone, backbone)  # whose copies would compute the same
+    settings = dataclasses.replace(recipe.training, compile=False)  # a count needs no compiler
+    backbone.apply_memory_savings(recipe.stage, requested_savings(settings, torch.device("cpu")))
+    return parameters
 
 
 def _fill_with_fakes(model: nn.Module) -> None:

@@ -347,3 +347,10 @@ def test_a_saving_that_a_backbone_does_not_support_is_not_considered(monkeypatch
     assert {"VAE slicing", "frozen in bf16", "gradient checkpointing"} == doctor.not_considered.keys()
     assert all("has no cheaper steps" in cause for cause in doctor.not_considered.values())
     assert not {CHECKPOINTING, FROZEN} & {*doctor.changes}
+
+
+def test_savings_are_counted_without_the_compiler_that_the_training_needs(monkeypatch):
+    monkeypatch.setattr("persist_cli.train.optimizer.COMPILERS", ())
+    monkeypatch.delenv("CXX", raising=False)
+    doctor = Doctor(micro_meta_model("training.compile=true"), Machine("cuda", 1, GIB), sharded=False)
+    assert doctor.not_considered == {}
