@@ -11,6 +11,7 @@ from torch import Tensor
 
 from persist_cli.api.ground import Body, GroundMap
 from persist_cli.api.policy import Goal, GoalKind
+from persist_cli.api.promises import check_costs
 from persist_cli.io.settings import NoSettings
 
 
@@ -54,6 +55,16 @@ class Cost(ABC):
     def of_body(self, body: Body) -> Cost:
         """Return the cost of an agent with a body; the same unless the cost measures where the body fits."""
         return self
+
+    def measured(self, futures: Futures, goal: Goal, ground: GroundMap) -> Float[Tensor, "candidate frame"]:
+        """Return what ``measure`` does, after a check that it is what that promises. Persist asks by this method.
+
+        Raises:
+            PluginError: when it is not; NaN may come of imagined frames.
+        """
+        costs = self.measure(futures, goal, ground)
+        check_costs(costs, self.name, tuple(futures.world_from_camera.shape[:2]))
+        return costs
 
     @abstractmethod
     def measure(self, futures: Futures, goal: Goal, ground: GroundMap) -> Float[Tensor, "candidate frame"]:

@@ -283,9 +283,9 @@ class Memory(ABC):
             OSError: when it cannot be written.
             PluginError: when what the memory gives can be no memory file.
         """
-        tensors, points, figures = self.tensors(), self.points(), self.figures()
+        tensors, points, header = self.tensors(), self.points(), self.header()
         check_stored(tensors, self.name, PATH)
         check_points(points.positions, points.colors, self.name)
-        check_counts(figures.cells, figures.imagined, self.name)
+        check_counts(header["cells"], header["imagined"], self.name)
         poses = {PATH + name: poses.contiguous() for name, poses in (paths or {}).items()}
-        write_tensors(path, dict(tensors) | poses, {"persist": json.dumps(self.header())})
+        write_tensors(path, dict(tensors) | poses, {"persist": json.dumps(header)})

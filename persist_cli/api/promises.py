@@ -172,7 +172,7 @@ def check_proposals(proposed: Any, policy: str, known: Collection[str], horizon:
                 raise _broken("policy", policy, f"propose gave the action {name!r}; known: {', '.join(known)}")
 
 
-def check_costs(costs: Any, cost: str, shape: tuple[int, int]) -> None:
+def check_costs(costs: Any, cost: str, shape: tuple[int, ...]) -> None:
     """Raise ``PluginError`` when costs are not what ``Cost.measure`` promises; NaN may come of imagined frames.
 
     Args:

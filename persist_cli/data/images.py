@@ -19,7 +19,7 @@ MILLIMETRES = 1000.0  # in a metre
 FARTHEST = 65.535  # metres; 16 bits of millimetres hold no more
 COMPRESSION = 1  # of 9: a third of the time of the default for a few per cent more bytes
 SIZE = re.compile(r"^(?P<height>\d{1,9})x(?P<width>\d{1,9})$")
-LARGEST_SIDE = 4096  # pixels that can be asked for, as of a simulator
+LARGEST_SIDE = 4096  # pixels that can be asked for, of a simulator too
 
 Array = np.ndarray[Any, Any]
 

@@ -178,7 +178,7 @@ def imagined_before_and_after(imagination: Imagination, text: str, file: Path, e
         raise DataError(f"--camera {text}: no frame leads to the first one; name a later one, or several as in :0-9")
     part, pictures = source.read(slice(frames.start, frames.stop)), []
     agent = world.agents[0]
-    for memory in (agent.memory, edited.copy().to(world.backbone.device)):  # a scene imagines what it is read for
+    for memory in (agent.memory, edited.copy().placed(world.backbone.device)):  # a scene imagines what it is read for
         agent.memory = memory
         world.reset([part.observations[:1]], [part.info])
         ways = [part.observations.cameras[1:]], [interactions_of(part.actions[:-1], part.info.vocabulary)]

@@ -85,7 +85,7 @@ def view_costs(cost: Cost, views: Observations, goal: Goal) -> list[float]:
     """
     free = torch.ones(1, len(views), dtype=torch.bool)
     futures = Futures(views.rgb[None], views.depth[None], views.cameras.world_from_camera[None], free)
-    costs = cost.measure(futures, goal, GroundMap.empty((0.0, 1.0, 0.0)))[0]
+    costs = cost.measured(futures, goal, GroundMap.empty((0.0, 1.0, 0.0)))[0]
     if bool(torch.isnan(costs).any()):
         raise PersistError(f"cost {cost.name!r} of a true view is NaN; take another --cost")
     return [float(value) for value in costs]

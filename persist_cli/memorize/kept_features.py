@@ -51,7 +51,7 @@ class KeptFeatures(Encoder):
 
     def to(self, device: torch.device | str) -> KeptFeatures:
         """Encode on ``device`` from now on; what is kept stays in the memory of the CPU."""
-        self.encoder, self.device = self.encoder.to(device), torch.device(device)
+        self.encoder, self.device = self.encoder.placed(device), torch.device(device)
         return self
 
     def encode(self, rgb: UInt8[Tensor, "frame height width 3"]) -> Float[Tensor, "frame rows columns channel"]:

@@ -216,7 +216,7 @@ def encode_frames(rgb: UInt8[Tensor, "frame height width 3"], size: int) -> Floa
     weights = chosen_encoder()
     with exact_inference():
         encoder = _load_encoder(str(cached_weight(weights.name)), weights.layer, size, network_device())
-        return encoder.encode(rgb).cpu()
+        return encoder.encoded(rgb).cpu()
 
 
 @lru_cache(maxsize=1)

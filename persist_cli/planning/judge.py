@@ -17,7 +17,6 @@ from persist_cli.api.cost import Cost
 from persist_cli.api.geometry import near_poses
 from persist_cli.api.ground import GroundMap
 from persist_cli.api.policy import Goal, Policy
-from persist_cli.api.promises import check_costs
 from persist_cli.errors import PersistError
 from persist_cli.planning.futures import CandidateWalk, FutureModel, Over
 
@@ -157,12 +156,10 @@ class Judge:
     def _judge_batch(self, candidates: list[tuple[str, ...]], number: int) -> None:
         begun = time.monotonic()
         imagined = self.model.imagine(candidates, self.over, self.cost.sees)
-        poses = imagined.futures.world_from_camera.double().cpu()
-        costs = self.cost.measure(imagined.futures, self.goal, self.ground)
-        check_costs(costs, self.cost.name, (poses.shape[0], poses.shape[1]))
-        costs = costs.double().cpu()
+        costs = self.cost.measured(imagined.futures, self.goal, self.ground).double().cpu()
         self.check(costs, candidates)
         if self.looked is not None:
+            poses = imagined.futures.world_from_camera.double().cpu()
             costs += LAST * near_poses(poses.flatten(0, 1), self.looked, NEAR, TURNED).any(-1).reshape(costs.shape)
         least, frame = costs.min(dim=1)
         for row, names in enumerate(candidates):

@@ -113,7 +113,7 @@ def look_at(planned: Planned, best: int) -> Shown:
         truth, seen = videos_of(true_model, candidates)
     except PersistError as error:  # an interaction, which walking back does not undo
         return Shown(candidates, imagined, None, None, None, str(error))
-    costs = planned.cost.measure(seen.futures, planned.goal, planned.ground)
+    costs = planned.cost.measured(seen.futures, planned.goal, planned.ground)
     true_costs = [float(costs[row, max(one.best - 1, 0)]) for row, one in enumerate(candidates)]
     if any(map(math.isnan, true_costs)):
         return Shown(candidates, imagined, None, None, None, f"its cost {planned.cost.name!r} is NaN")

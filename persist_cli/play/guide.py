@@ -162,7 +162,7 @@ class Guide:
         rgb, depth = views.denoise_frame(clips, [length] * len(ways))
         free = torch.ones(len(ways), 1, dtype=torch.bool)
         futures = Futures(rgb[:, None], depth[:, None], torch.stack(poses)[:, None], free)
-        return self._cost.measure(futures, self.goal, ground)[:, 0]
+        return self._cost.measured(futures, self.goal, ground)[:, 0]
 
     def _approach(self, world: WorldModel) -> InParts[tuple[str, ...]]:
         """Return the actions to the best view on short ways; none where staying looks as good."""

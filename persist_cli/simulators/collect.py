@@ -27,6 +27,7 @@ import numpy as np
 
 from persist_cli.api.observations import Frame, TrajectoryInfo
 from persist_cli.api.simulator import Simulator, random_ground
+from persist_cli.data.images import LARGEST_SIDE
 from persist_cli.data.storable import faults_of, shown
 from persist_cli.data.store import write_trajectory
 from persist_cli.errors import DataError
@@ -43,7 +44,6 @@ PLAN_FILE = "collect.json"
 VERSION = 1
 SPLIT_SCENES = 1_000_000  # of each split
 FIRST_SEED = {"train": 0, "validation": 2 * SPLIT_SCENES, "test": SPLIT_SCENES}  # generator seeds of the splits
-LARGEST_SIDE = 4096  # pixels
 START_TRIES = 100
 OPEN_WAY = 1.0  # metres that must be free in front of a start
 

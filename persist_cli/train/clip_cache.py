@@ -331,4 +331,5 @@ def _features_hash(encoder: Encoder, backbone: Backbone) -> str:
     """A hash of the features of a picture of the backbone's size."""
     height, width = backbone.image_size
     picture = torch.arange(height * width * 3).reshape(1, height, width, 3) * 37 % 256
-    return hashlib.sha256(encoder.encode(picture.to(torch.uint8)).float().cpu().contiguous().numpy().data).hexdigest()
+    features = encoder.encoded(picture.to(torch.uint8)).float().cpu().contiguous()
+    return hashlib.sha256(features.numpy().data).hexdigest()

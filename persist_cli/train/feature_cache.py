@@ -51,6 +51,6 @@ class FeatureCache:
         features = []
         for piece in Source(file, range(len(file)), str(file.path)).pieces():
             digests += frame_digests(piece.rgb)
-            features.append(self.encoder.encode(piece.rgb.to(self.encoder.device)).cpu())
+            features.append(self.encoder.encoded(piece.rgb.to(self.encoder.device)).cpu())
         rows = torch.tensor([list(digest) for digest in digests], dtype=torch.uint8)
         return {FRAMES: rows, "features": torch.cat(features)}

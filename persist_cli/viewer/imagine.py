@@ -137,7 +137,7 @@ class Imaginer:
         if self._empty is not None:
             agent.memory = (self._empty if memory is None else memory).copy()
             agent.memory.encoder = self._empty.encoder  # that of the page's memory stays where it is
-            agent.memory.to(world.backbone.device)
+            agent.memory.placed(world.backbone.device)
 
     def _opened(self, memory: Memory | None) -> WorldModel:
         if self._world is None:

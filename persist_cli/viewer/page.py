@@ -293,7 +293,7 @@ class Page:
         assert self.session is not None
         if camera is None:
             return
-        tokens = self.session.edited.read(camera, int(self._budget.value))
+        [tokens] = self.session.edited.recall([camera], int(self._budget.value))
         self.stage.draw_tokens(tokens)
         imagined = int((tokens.origins == CellOrigin.IMAGINED).sum())
         self._read_text.say(f"{len(tokens):,} tokens, {imagined:,} of them imagined, {tokens.bytes:,} bytes")

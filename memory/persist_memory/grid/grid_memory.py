@@ -104,8 +104,8 @@ class GridMemory(Memory):
             DataError: when a pose is not finite and rigid, or a camera lies beyond the grid; then nothing is written.
         """
         check_observations(observations, f"memory {self.name!r}")
-        centers = observations.cameras.centers.double().cpu() @ self.lattice.grid_from_world.T
-        check_within_grid(centers, self.lattice.size, f"memory {self.name!r}")
+        lattice = self.lattice
+        check_within_grid(observations.cameras, lattice.grid_from_world, lattice.size, f"memory {self.name!r}")
         if not len(observations):
             return
         on_cpu = observations.depth.device.type == "cpu"

@@ -19,6 +19,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+from persist_cli.api.cameras import Cameras
 from persist_cli.errors import FrameError
 
 AXIS_BITS = 21  # of one coordinate
@@ -64,26 +65,30 @@ def keys_of_numbers(numbers: Int64[Tensor, " cell"]) -> Int64[Tensor, " cell"]:
     return pack(*coordinates)
 
 
-def check_within_grid(centers: Float[Tensor, "frame 3"], size: Float[Tensor, " 3"] | float, where: str) -> None:
+def check_within_grid(
+    cameras: Cameras, axes: Float[Tensor, "3 3"], size: Float[Tensor, " 3"] | float, where: str
+) -> None:
     """Check that cameras lie where cells have numbers.
 
     Args:
-        centers: places of the cameras along the grid's axes, in metres from the world's origin.
+        cameras: the cameras, with the frame axis alone.
+        axes: the rotation from the world into the grid's axes, on the CPU.
         size: metres of a cell along each axis.
         where: what the message begins with.
 
     Raises:
         FrameError: for the first camera that lies beyond.
     """
-    edges = torch.as_tensor(size, dtype=torch.float64, device=centers.device).expand(3)
-    beyond = centers.double().abs() >= (LIMIT - 1) * edges
+    centers = cameras.centers.double().cpu() @ axes.T
+    edges = torch.as_tensor(size, dtype=torch.float64).expand(3)
+    beyond = centers.abs() >= (LIMIT - 1) * edges
     if not bool(beyond.any()):
         return
     frame, axis = beyond.nonzero()[0].tolist()
     raise FrameError(
         where,
         frame,
-        f"its camera lies {float(centers[frame].double().norm()) / 1000:,.0f} km from the world's origin, the grid "
+        f"its camera lies {float(centers[frame].norm()) / 1000:,.0f} km from the world's origin, the grid "
         f"reaches {LIMIT * float(edges[axis]) / 1000:,.0f} km; move the origin near the cameras (subtract one place "
         "from all poses), or leave the frame out if its pose is wrong",
     )

@@ -111,8 +111,7 @@ class GridScene(Scene):
                 too large; then nothing is written.
         """
         check_observations(observations, f"memory {self.name!r}")
-        centers = observations.cameras.centers.double().cpu() @ self._axes.T
-        check_within_grid(centers, self.settings.size, f"memory {self.name!r}")
+        check_within_grid(observations.cameras, self._axes, self.settings.size, f"memory {self.name!r}")
         for origin, frames in observations.by_origin() if len(observations) else ():
             if origin == Origin.IMAGINED and not self.settings.writes_imagined:
                 continue

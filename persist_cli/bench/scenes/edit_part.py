@@ -224,7 +224,7 @@ def rendered(
     bench: SceneBench, renderer: Renderer, trial: EditTrial, memory: Scene, seed: int
 ) -> UInt8[Tensor, "1 height width 3"]:
     """Return the last frame of a trial's clip, as it is imagined with a memory."""
-    world = renderer.world(memory.to(renderer.backbone.device), trial.view, seed, False, bench)
+    world = renderer.world(memory.placed(renderer.backbone.device), trial.view, seed, False, bench)
     clips: list[Observations] = [seen for [seen] in world.imagine([trial.path], [(None,) * len(trial.path)])]
     return clips[-1].rgb[-1:]
 
