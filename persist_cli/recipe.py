@@ -23,6 +23,7 @@ EXTENDS: Final = "extends"
 # the key that chooses a variant: settings of one variant mean nothing to another
 CHOSEN_BY: Final = {"backbone": "name", "memory": "name", "policy": "name", "scene": "name", "adapter": "form"}
 SETTINGS: Final = ("adapter", "settings", "encoder_settings")  # keys that may be left empty
+ADAPTER_FORM: Final = "adapter.form"  # beside which the adapter has nothing but settings of that form
 NAMES: Final = ("backbone.name", "memory.name", "policy.name", "scene.name")
 SETTINGS_OF: Final = {"memory.encoder": "encoder_settings"} | dict.fromkeys(NAMES, "settings")
 # the stages of networks that are no backbones, and what of the data means something to them, by the key for one
@@ -256,8 +257,8 @@ def parse_yaml_mapping(text: str, where: str) -> dict[str, Any]:
 def apply_overrides(values: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
     """Return a changed copy of the mapping.
 
-    ``training.steps=200`` sets the key ``steps`` in the mapping ``training``. Where another backbone, memory or encoder
-    is named, the settings that the mapping has for the one before are left out.
+    ``training.steps=200`` sets the key ``steps`` in the mapping ``training``. Where another backbone, memory, encoder
+    or adapter form is named, the settings that the mapping has for the one before are left out.
 
     Args:
         values: plain values, as YAML gives them.
@@ -271,8 +272,12 @@ def apply_overrides(values: Mapping[str, Any], overrides: Sequence[str]) -> dict
     for key, value in settings:
         owner, _, choice = key.partition(".")
         mapping = changed.get(owner)
-        if key in SETTINGS_OF and isinstance(mapping, dict) and mapping.get(choice, value) != value:
+        if not isinstance(mapping, dict) or mapping.get(choice, value) == value:
+            continue
+        if key in SETTINGS_OF:
             mapping.pop(SETTINGS_OF[key], None)
+        elif key == ADAPTER_FORM:
+            mapping.clear()
     for key, value in settings:
         *parents, last = key.split(".")
         mapping = changed

@@ -138,6 +138,15 @@ def test_another_encoder_on_the_command_line_does_not_inherit_encoder_settings(c
     assert same.encoder_settings == recipe["memory"]["encoder_settings"]
 
 
+def test_another_adapter_form_on_the_command_line_does_not_inherit_settings_of_the_form_before():
+    recipe = read_recipe("houses-64-forms-canvas")
+    assert "canvas_scale" in recipe["adapter"]
+    changed = make_recipe(apply_overrides(recipe, ["adapter.every=2", "adapter.form=cross"]), "x").adapter
+    same = make_recipe(apply_overrides(recipe, ["adapter.form=canvas", "adapter.width=64"]), "x").adapter
+    assert changed == {"form": "cross", "every": 2}
+    assert same == recipe["adapter"] | {"width": 64}
+
+
 def test_a_recipe_cannot_extend_itself_or_an_unknown_recipe(tmp_path):
     (tmp_path / "a.yaml").write_text("extends: b.yaml")
     (tmp_path / "b.yaml").write_text("extends: a.yaml")
