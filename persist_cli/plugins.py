@@ -20,7 +20,7 @@ from pathlib import Path
 from types import FrameType, TracebackType
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from persist_cli.errors import TRACEBACK, PersistError, PluginError, RecipeError, hint
+from persist_cli.errors import TRACEBACK, DataError, PersistError, PluginError, RecipeError, hint
 
 if TYPE_CHECKING:
     from persist_cli.api.backbone import Backbone
@@ -173,6 +173,23 @@ def _flaw(loaded: Any, base: type, kind: PluginKind) -> str:
     except TypeError:
         return f"its __init__ does not take ({', '.join(kind.arguments)})"
     return ""
+
+
+@contextlib.contextmanager
+def faults_of(kind: str, name: str) -> Iterator[None]:
+    """Within the block, what a check finds wrong is the fault of a plugin, which gave it.
+
+    Args:
+        kind: kind of the plugin, such as ``importer``.
+        name: name of the plugin.
+
+    Raises:
+        PluginError: naming the plugin, from a ``DataError``.
+    """
+    try:
+        yield
+    except DataError as error:
+        raise find_plugin(kind, name).error(f"is broken: {error}", str(error)) from error
 
 
 @contextlib.contextmanager

@@ -37,8 +37,9 @@ from persist_cli.memorize.memory_config import scene_config
 from persist_cli.navigation.ground_mapper import GroundMapper, body_of
 from persist_cli.navigation.ways import way_is_free
 from persist_cli.output.console import add_task, busy, print_json, print_table, progress, say
-from persist_cli.plugins import check_simulator, make_simulator
+from persist_cli.plugins import check_simulator
 from persist_cli.rollout.world_model import Agent, WorldModel
+from persist_cli.simulators.checked import checked_simulator
 from persist_cli.simulators.collect import CollectPlan
 
 SHARES: Final = {"forward": 0.6, "backward": 0.1, "left": 0.15, "right": 0.15}  # how often an action is drawn
@@ -163,7 +164,7 @@ def walk_houses(plan: CollisionPlan, size: tuple[int, int], checkpoint: Checkpoi
     Raises:
         DataError: when the model was trained on one of the scenes.
     """
-    simulator = make_simulator(plan.scenes.simulator, {"height": size[0], "width": size[1]})
+    simulator = checked_simulator(plan.scenes.simulator, {"height": size[0], "width": size[1]})
     known, seeds = scenes_to_avoid([checkpoint]), plan.scenes.generator_seeds
     houses = []
     with progress() as bar:

@@ -70,6 +70,11 @@ def bench_episodes(
     scenes: Annotated[str, typer.Option(help="Scene seeds A:B, B not included.")] = "0:24",
     split: Annotated[str, typer.Option(help="train, validation or test: they share no scene.")] = "test",
     size: Annotated[str, typer.Option(help="Image size HxW in pixels.")] = "64x64",
+    step: Annotated[float, typer.Option(help="Metres of a step.")] = 0.25,
+    turn: Annotated[float, typer.Option(help="Degrees of a turn.")] = 15.0,
+    fov: Annotated[float | None, typer.Option(help="Degrees of view from top to bottom; 75 in miniworld.")] = None,
+    height: Annotated[float | None, typer.Option(help="Metres of the camera above the floor; 1.25.")] = None,
+    pitch: Annotated[float | None, typer.Option(help="Degrees that the camera looks up; 0.")] = None,
     bins: Annotated[str, typer.Option(help="Actions of the shortest ways, separated by commas.")] = "8,16,32,64",
     each: Annotated[int, typer.Option(min=1, help="Most of each bin, in sight and hidden.")] = 16,
     per_scene: Annotated[int, typer.Option(min=1, help="Most of each of these in one scene.")] = 1,
@@ -93,7 +98,9 @@ def bench_episodes(
         bins=whole_numbers("--bins", bins), each=each, walk_frames=walk_frames, seed=seed, per_scene=per_scene,
         goal_gap=goal_gap, goals=goals,
     )  # fmt: skip
-    run_episodes(CollectPlan(simulator=simulator, scenes=scenes, size=size, split=split), search, out, json)
+    agent = {"step": step, "turn": turn, "fov": fov, "height": height, "pitch": pitch}
+    given = {name: f"{value}" for name, value in agent.items() if value is not None}
+    run_episodes(CollectPlan(simulator=simulator, scenes=scenes, size=size, split=split, **given), search, out, json)
 
 
 @bench_app.command("collisions")

@@ -48,7 +48,7 @@ def view(
     from persist_cli.viewer.view import Address, ViewPlan, run_view
 
     if export is not None:
-        unused = "out checkpoint adapter seed host port"
+        unused = "out start checkpoint adapter seed host port"
         refuse_options(context, unused, "not with --export, which writes a page that edits and imagines nothing")
     plan = ViewPlan(
         source=source, truth=truth, start=start, imagine=ImagineSettings(checkpoint, adapter, seed), out=out, most=most,

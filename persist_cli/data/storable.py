@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import numbers
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -17,26 +15,8 @@ from persist_cli.api.cameras import check_intrinsics, check_pose
 from persist_cli.api.cells import CellGrid
 from persist_cli.api.observations import Frame, TrajectoryInfo
 from persist_cli.errors import DataError
-from persist_cli.plugins import find_plugin
 
 LONGEST = 60  # characters of a wrong value in a message
-
-
-@contextlib.contextmanager
-def faults_of(kind: str, name: str) -> Iterator[None]:
-    """Within the block, what a check finds wrong is the fault of a plugin, which gave it.
-
-    Args:
-        kind: kind of the plugin, such as ``importer``.
-        name: name of the plugin.
-
-    Raises:
-        PluginError: naming the plugin, from a ``DataError``.
-    """
-    try:
-        yield
-    except DataError as error:
-        raise find_plugin(kind, name).error(f"is broken: {error}", str(error)) from error
 
 
 def shown(value: Any) -> str:

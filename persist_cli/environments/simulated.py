@@ -16,7 +16,7 @@ from persist_cli.environments.environment import HouseEnv, HouseVectorEnv, Scene
 from persist_cli.environments.task import Attempt, TaskSettings, View
 from persist_cli.errors import DataError
 from persist_cli.io.settings import parse_settings
-from persist_cli.plugins import check_simulator, make_simulator
+from persist_cli.simulators.checked import checked_simulator
 from persist_cli.simulators.collect import CollectPlan, random_start
 from persist_cli.simulators.free_grid import Cell, FreeGrid, Ground, clear_distance
 
@@ -81,10 +81,9 @@ class SimulatedScenes(Scenes):
 
     def __init__(self, settings: SimulatedSettings, count: int = 1) -> None:
         plan = settings.plan()
-        check_simulator(settings.simulator)
         height, width = plan.image_size
         agent = {"height": height, "width": width} | settings.settings
-        self.houses = [OpenHouse(make_simulator(settings.simulator, agent), settings) for _ in range(count)]
+        self.houses = [OpenHouse(checked_simulator(settings.simulator, agent), settings) for _ in range(count)]
         self.seeds = plan.generator_seeds
         self.houses[0].open(self.seeds[0])
         super().__init__(self.houses[0].simulator.info, settings)

@@ -10,7 +10,7 @@ from persist_cli.episodes.find_episodes import EpisodeSearch, find_episodes
 from persist_cli.errors import DataError
 from persist_cli.io.files import check_file
 from persist_cli.output.console import add_task, print_json, print_table, progress, say
-from persist_cli.plugins import check_simulator, make_simulator
+from persist_cli.simulators.checked import checked_simulator
 from persist_cli.simulators.collect import CollectPlan
 
 
@@ -23,8 +23,7 @@ def draw_episodes(scenes: CollectPlan, search: EpisodeSearch) -> EpisodeSet:
     """
     scenes.check()
     search.check()
-    check_simulator(scenes.simulator)
-    simulator = make_simulator(scenes.simulator, scenes.agent_settings(lambda wanted: wanted.low))
+    simulator = checked_simulator(scenes.simulator, scenes.agent_settings(lambda wanted: wanted.low))
     seeds, episodes = scenes.generator_seeds, list[Episode]()
     with progress() as bar:
         task = add_task(bar, "episodes", len(seeds), "scenes")

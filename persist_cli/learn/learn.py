@@ -40,7 +40,7 @@ from persist_cli.memorize.sources import common_reference, find_sources
 from persist_cli.output.console import add_task, print_json, print_table, progress, say
 from persist_cli.output.curve import Curve, draw_curves
 from persist_cli.planning.true_futures import open_again
-from persist_cli.plugins import make_policy, make_settings
+from persist_cli.plugins import load_plugin, make_policy, make_settings
 from persist_cli.policies.open_policy import acting_settings, open_policy
 from persist_cli.policies.trained import TrainedPolicy, find_policy, packaged_policy
 from persist_cli.recipe import apply_overrides, make_recipe
@@ -284,13 +284,13 @@ def check_agent(file: Path, episodes: EpisodeSet, simulator: Simulator) -> None:
     """Raise ``DataError`` when the agent of some episodes is another than that of the views' simulator."""
     if episodes.simulator != simulator.name:
         raise DataError(f"{file}: episodes of simulator {episodes.simulator!r}, the views are of {simulator.name!r}")
-    drawn = asdict(parse_settings(simulator.settings_type, episodes.settings, str(file)))
+    drawn = asdict(parse_settings(load_plugin("simulator", simulator.name).settings_type, episodes.settings, str(file)))
     ours = asdict(simulator.settings)
     other = [name for name in drawn if drawn[name] != ours[name]]
     if other:
         theirs, own = (" and ".join(f"{name} {values[name]}" for name in other) for values in (drawn, ours))
         raise DataError(
-            f"{file}: episodes with {theirs}, the views were collected with {own}; `bench episodes` has --size alone"
+            f"{file}: episodes with {theirs}, the views were collected with {own}; give them to `bench episodes`"
         )
 
 

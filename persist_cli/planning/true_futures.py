@@ -11,7 +11,8 @@ from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.api.simulator import Simulator
 from persist_cli.errors import PersistError
 from persist_cli.planning.futures import SimulatorFutures
-from persist_cli.plugins import load_plugin, make_simulator
+from persist_cli.plugins import load_plugin
+from persist_cli.simulators.checked import checked_simulator
 
 ALIKE = 8.0  # levels of 255 by which the start frame may differ on average when it is rendered again
 
@@ -41,7 +42,7 @@ def open_again(info: TrajectoryInfo) -> Simulator | None:
     name, scene = info.source.get("simulator"), info.source.get("house")
     if not isinstance(name, str) or not isinstance(scene, int):
         return None
-    simulator = make_simulator(name, simulator_settings(name, info))
+    simulator = checked_simulator(name, simulator_settings(name, info))
     simulator.open_scene(scene)
     return simulator
 

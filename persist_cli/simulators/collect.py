@@ -28,13 +28,12 @@ import numpy as np
 from persist_cli.api.observations import Frame, TrajectoryInfo
 from persist_cli.api.simulator import Simulator, random_ground
 from persist_cli.data.images import LARGEST_SIDE
-from persist_cli.data.storable import faults_of, shown
 from persist_cli.data.store import write_trajectory
 from persist_cli.errors import DataError
 from persist_cli.io.files import read_json, remove_leftovers, write_json
 from persist_cli.output.console import add_task, print_json, progress, say
-from persist_cli.plugins import check_simulator, load_plugin, make_settings, make_simulator, plugin_errors
-from persist_cli.simulators.answers import check_agent, check_scene
+from persist_cli.plugins import check_simulator, load_plugin, make_settings, plugin_errors
+from persist_cli.simulators.checked import checked_simulator
 from persist_cli.simulators.free_grid import clear_distance
 from persist_cli.simulators.policies import POLICIES, walk
 from persist_cli.simulators.ranges import Range
@@ -253,13 +252,9 @@ def scene_simulator(plan: CollectPlan, seed: int, last: Simulator | None) -> Sim
     draws = np.random.default_rng([plan.seed, seed, AGENT_DRAWS])
     values = plan.agent_settings(lambda wanted: wanted.draw(draws))
     if last is None:
-        return make_simulator(plan.simulator, values)
+        return checked_simulator(plan.simulator, values)
     settings = make_settings("simulator", plan.simulator, values)
-    simulator = last if settings == last.settings else last.with_settings(settings)
-    with faults_of("simulator", last.name):
-        if not isinstance(simulator, Simulator):
-            raise DataError(f"with_settings() returned {shown(simulator)}, no Simulator")
-    return simulator
+    return last if settings == last.settings else last.with_settings(settings)
 
 
 def scene_look(plan: CollectPlan, seed: int) -> Look:
@@ -303,9 +298,7 @@ def collect_frames(simulator: Simulator, plan: CollectPlan, seed: int) -> Iterat
     """
     random = np.random.default_rng([plan.seed, seed])
     simulator.open_scene(seed)
-    check_scene(simulator)
     simulator.place(random_start(simulator, random), float(random.uniform(-math.pi, math.pi)))
-    check_agent(simulator)
     return walk(simulator, POLICIES[plan.policy], random, plan.frames)
 
 

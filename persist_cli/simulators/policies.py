@@ -10,10 +10,9 @@ from dataclasses import replace
 import numpy as np
 
 from persist_cli.api.actions import STAY
-from persist_cli.api.observations import Frame, TrajectoryInfo
+from persist_cli.api.observations import Frame
 from persist_cli.api.simulator import Simulator
 from persist_cli.errors import DataError
-from persist_cli.simulators.answers import acted, movable_things, observed
 from persist_cli.simulators.free_grid import FreeGrid, Ground, clear_distance
 from persist_cli.simulators.way_back import Pose, WayBack
 
@@ -55,12 +54,11 @@ def walk(simulator: Simulator, policy: Policy, random: np.random.Generator, fram
         DataError: when the world refuses every action of the policy.
         PluginError: when the simulator gives a wrong answer.
     """
-    info = simulator.info
     actions = policy(simulator, random, frames - 1)
     for number in range(frames - 1):
-        frame = observed(simulator, info)
-        yield replace(frame, action=_next_allowed(simulator, actions, info, first=number == 0), timestamp=float(number))
-    yield replace(observed(simulator, info), action=None, timestamp=float(frames - 1))
+        frame = replace(simulator.observe(), cells=simulator.cells(), timestamp=float(number))
+        yield replace(frame, action=_next_allowed(simulator, actions, first=number == 0))
+    yield replace(simulator.observe(), cells=simulator.cells(), action=None, timestamp=float(frames - 1))
 
 
 def explore(simulator: Simulator, random: np.random.Generator, count: int) -> ActionStream:
@@ -179,7 +177,7 @@ def _place_before_a_thing(
     away = grid.distances(simulator.agent[0])
     low, high = BEFORE_THING
     sides = {thing: [cell for cell in sorted(away) if low <= math.dist(grid.place(cell), thing) <= high]
-             for thing in movable_things(simulator)}  # fmt: skip
+             for thing in simulator.movable()}  # fmt: skip
     things = [thing for thing, cells in sides.items() if cells]
     if not things:
         return None
@@ -222,11 +220,11 @@ def _go_out(simulator: Simulator, outward: ActionStream, count: int, back: WayBa
         action = outward.send(allowed)
 
 
-def _next_allowed(simulator: Simulator, actions: ActionStream, info: TrajectoryInfo, first: bool) -> str:
+def _next_allowed(simulator: Simulator, actions: ActionStream, first: bool) -> str:
     """Do the policy's next action that the world allows, and return its name."""
     action = next(actions) if first else actions.send(True)
     for _ in range(MOST_REFUSALS):
-        if acted(simulator, action, info):
+        if simulator.act(action):
             return action
         action = actions.send(False)
     raise DataError(f"{simulator.info.scene}: the agent cannot move; the last {MOST_REFUSALS} actions were refused")

@@ -173,9 +173,14 @@ def test_a_bin_without_episodes_is_refused_with_those_there_are(episodes: Episod
 def test_the_command_writes_episodes_that_can_be_read(persist: Persist, tmp_path: Path) -> None:
     out = tmp_path / "episodes.json"
     options = ("--scenes", "1:2", "--bins", "8", "--each", "1", "--size", "32x32", "--walk-frames", "4")
-    ended = persist("bench", "episodes", *options, "--out", out, "--json")
+    agent = ("--step", "0.5", "--turn", "30", "--fov", "60", "--height", "1", "--pitch", "-10")
+    ended = persist("bench", "episodes", *options, *agent, "--out", out, "--json")
     assert ended.code == 0, ended.err
-    assert json.loads(ended.out)["episodes"] == len(read_episodes(out).episodes) >= 1
+    drawn = read_episodes(out)
+    assert json.loads(ended.out)["episodes"] == len(drawn.episodes) >= 1
+    expected = {"step": 0.5, "turn": 30, "fov": 60, "camera_height": 1, "pitch": -10, "height": 32, "width": 32}
+    assert drawn.settings == drawn.settings | expected
+    assert all(episode.metres % 0.5 == 0 for episode in drawn.episodes)  # 0.25 m otherwise
 
 
 @pytest.mark.parametrize(
@@ -186,6 +191,8 @@ def test_the_command_writes_episodes_that_can_be_read(persist: Persist, tmp_path
         (("--scenes", "5:5"), "write A:B with A less than B"),
         (("--simulator", "miniwrld"), "did you mean 'miniworld'"),
         (("--split", "held-out"), "unknown split"),
+        (("--turn", "0"), "--turn '0.0': it must lie between 0.1 and 180"),
+        (("--fov", "200"), "fov"),
         (("--goals", "seen"), "unknown --goals 'seen'; known: both, in-sight, hidden"),
         (("--goal-gap", "inf"), "--goal-gap inf: give metres, 0 for none"),
         (("--out", "/"), "/: a folder; name a file to write"),

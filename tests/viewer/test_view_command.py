@@ -33,6 +33,7 @@ def test_a_trajectory_is_exported_as_one_page(persist, walks, tmp_path):
     [
         (["--export", "page.txt"], "name a page to write, as in view.html"),
         (["--export", "page.html", "--port", "0", "--out", "edited.safetensors"], "--out, --port: not with --export"),
+        (["--export", "page.html", "--start", "sample#0"], "--start: not with --export"),
     ],
 )
 def test_a_page_that_cannot_be_exported_is_one_line(persist, voxel_map, tmp_path, monkeypatch, options, words):

@@ -36,9 +36,10 @@ from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.metrics.src import chosen_encoder
 from persist_cli.output.console import add_task, busy, progress
 from persist_cli.planning.planners import check_horizon
-from persist_cli.plugins import check_simulator, make_cost, make_simulator
+from persist_cli.plugins import make_cost
 from persist_cli.policies.open_policy import acting_settings, open_policy
 from persist_cli.policies.trained import TrainedPolicy, find_policy, packaged_policy
+from persist_cli.simulators.checked import checked_simulator
 from persist_cli.simulators.collect import CollectPlan
 
 LOOPS: Final = ("closed", "open")
@@ -317,8 +318,7 @@ def open_simulator(episodes: EpisodeSet) -> Simulator:
     Raises:
         PluginError: when it is not installed.
     """
-    check_simulator(episodes.simulator)
-    return make_simulator(episodes.simulator, episodes.settings)
+    return checked_simulator(episodes.simulator, episodes.settings)
 
 
 def find_thresholds(

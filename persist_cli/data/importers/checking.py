@@ -11,9 +11,9 @@ from typing import Any
 
 from persist_cli.api.importer import ForeignTrajectory, Importer
 from persist_cli.api.observations import Frame
-from persist_cli.data.storable import check_given_frame, check_info, faults_of, shown
+from persist_cli.data.storable import check_given_frame, check_info, shown
 from persist_cli.errors import DataError
-from persist_cli.plugins import find_plugin
+from persist_cli.plugins import faults_of, find_plugin
 
 NAME = re.compile(r"[^./\\#:\x00-\x1f\x7f][^/\\#:\x00-\x1f\x7f]*")
 LONGEST_NAME = 200  # bytes; file systems take 255, and a file that is being written has a longer name

@@ -15,14 +15,13 @@ from persist_cli.data.held_out import HELD_OUT_FROM, ONLY_BEFORE
 from persist_cli.data.images import CropResize, crop_resize
 from persist_cli.data.importers.checking import checked_trajectories
 from persist_cli.data.importers.gravity import FROM_CAMERAS, GIVEN, Direction, up_text
-from persist_cli.data.storable import faults_of
 from persist_cli.data.store import SUFFIX, TrajectoryFile, write_trajectory
 from persist_cli.data.store_header import schema
 from persist_cli.errors import DataError
 from persist_cli.io.command_line import quoted
 from persist_cli.io.files import check_folder, remove_leftovers
 from persist_cli.output.console import add_task, print_json, print_table, progress, say, warn
-from persist_cli.plugins import make_importer
+from persist_cli.plugins import find_plugin, make_importer
 
 MOST_CAUSES = 3  # that are printed for a trajectory
 ABANDONED = 600.0  # seconds without a change after which what an import wrote is no longer being written
@@ -259,11 +258,11 @@ def _checked(frames: Iterator[Frame], info: TrajectoryInfo, importer: Importer) 
     """Yield the frames; ``PluginError`` naming the importer for an action that is not in the vocabulary."""
     for number, frame in enumerate(frames):
         if frame.action is not None and frame.action not in info.vocabulary.names:
-            with faults_of("importer", importer.name):
-                raise DataError(
-                    f"frame {number} takes the action {frame.action!r}, which its vocabulary "
-                    f"({', '.join(info.vocabulary.names)}) does not have"
-                )
+            cause = (
+                f"frame {number} takes the action {frame.action!r}, which its vocabulary "
+                f"({', '.join(info.vocabulary.names)}) does not have"
+            )
+            raise find_plugin("importer", importer.name).error(f"is broken: {cause}", cause)
         yield frame
 
 

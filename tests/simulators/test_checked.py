@@ -1,4 +1,4 @@
-"""What a simulator answers wrongly is one line that names it, and no trajectory is left of it."""
+"""What a simulator answers wrongly is one line that names it, wherever it is asked, and no trajectory is left of it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,12 @@ from persist_cli.api.actions import walking_actions
 from persist_cli.api.observations import Frame, TrajectoryInfo
 from persist_cli.api.simulator import Simulator
 from persist_cli.data.store import Store
+from persist_cli.environments.simulated import SimulatedScenes, SimulatedSettings
+from persist_cli.episodes.find_episodes import EpisodeSearch
+from persist_cli.episodes.make_episodes import run_episodes
 from persist_cli.errors import DataError, PluginError
+from persist_cli.planning.futures import SimulatorFutures
+from persist_cli.simulators.checked import checked_simulator
 from persist_cli.simulators.collect import CollectPlan, run_collect
 from tests.support.packages import install
 
@@ -115,9 +120,14 @@ class Hall(Simulator):
 
 
 @pytest.fixture
-def collect(site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, collecting_here):
-    """Collect a plan from a hall that gives some wrong answers."""
+def hall(site: Path) -> None:
+    """Install the hall as a simulator of another package."""
     install(site, "persist-hall", "persist.simulators", "hall = hall_world:Hall", f"from {__name__} import Hall")
+
+
+@pytest.fixture
+def collect(hall: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, collecting_here: None):
+    """Collect a plan from a hall that gives some wrong answers."""
 
     def run(plan: CollectPlan = PLAN, **wrong: Any) -> None:
         monkeypatch.setattr(Hall, "wrong", wrong)
@@ -189,6 +199,42 @@ def test_things_that_lie_nowhere_are_refused(collect, things: Any) -> None:
 def test_other_settings_must_give_a_simulator(collect) -> None:
     with pytest.raises(PluginError, match=r"is broken: with_settings\(\) returned None, no Simulator"):
         collect(replace(PLAN, turn="10:20"), with_settings=None)
+
+
+def test_an_environment_checks_its_simulator(hall, monkeypatch: pytest.MonkeyPatch) -> None:
+    houses = SimulatedScenes(SimulatedSettings(simulator="hall", scenes="0:1", size="8x8"))
+    houses.begin(0, np.random.default_rng(0), {})
+    assert houses.walk({0: ["left"]})[0][0].rgb.shape == (8, 8, 3)
+    for wrong in ({"act": 1}, {"observe": None}, {"agent": None}):
+        monkeypatch.setattr(Hall, "wrong", wrong)
+        with pytest.raises(PluginError, match=rf"^simulator 'hall' .* is broken: {next(iter(wrong))}"):
+            houses.walk({0: ["left"]})
+
+
+def test_the_search_for_episodes_checks_its_simulator(hall, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Hall, "wrong", {"is_free": "yes"})
+    with pytest.raises(PluginError, match=r"^simulator 'hall' .* is broken: is_free\(.*\) returned 'yes', no bool"):
+        run_episodes(replace(PLAN, split="validation"), EpisodeSearch(), tmp_path / "episodes.json", json=True)
+    assert not (tmp_path / "episodes.json").exists()
+
+
+def test_a_simulator_as_a_model_is_checked(hall, monkeypatch: pytest.MonkeyPatch) -> None:
+    simulator = checked_simulator("hall", {})
+    simulator.open_scene(0)
+    simulator.place((0.0, 0.0), 0.0)
+    future = SimulatorFutures(simulator)
+    assert future.imagine([["forward", "left"]], "best").futures.rgb.shape == (1, 2, 8, 8, 3)
+    monkeypatch.setattr(Hall, "wrong", {"frame": {"rgb": None}})
+    with pytest.raises(PluginError, match=r"is broken: observe\(\): rgb is None, no array of numpy"):
+        future.imagine([["forward", "left"]], "best")
+
+
+def test_a_stance_that_is_none_is_refused(hall, monkeypatch: pytest.MonkeyPatch) -> None:
+    simulator = checked_simulator("hall", {})
+    assert simulator.stance(np.eye(4)) is None
+    monkeypatch.setattr(Hall, "stance", lambda self, pose: (0.0, 0.0, 0.0))
+    with pytest.raises(PluginError, match=r"is broken: stance\(\) returned \(0.0, 0.0, 0.0\), not \(\(x, y\)"):
+        simulator.stance(np.eye(4))
 
 
 @pytest.mark.parametrize(("option", "setting"), [("height", "camera_height"), ("fov", "fov"), ("pitch", "pitch")])
