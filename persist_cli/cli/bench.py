@@ -98,9 +98,12 @@ def bench_episodes(
         bins=whole_numbers("--bins", bins), each=each, walk_frames=walk_frames, seed=seed, per_scene=per_scene,
         goal_gap=goal_gap, goals=goals,
     )  # fmt: skip
-    agent = {"step": step, "turn": turn, "fov": fov, "height": height, "pitch": pitch}
-    given = {name: f"{value}" for name, value in agent.items() if value is not None}
-    run_episodes(CollectPlan(simulator=simulator, scenes=scenes, size=size, split=split, **given), search, out, json)
+    of_camera = [None if value is None else str(value) for value in (fov, height, pitch)]
+    plan = CollectPlan(
+        simulator=simulator, scenes=scenes, size=size, split=split, step=str(step), turn=str(turn), fov=of_camera[0],
+        height=of_camera[1], pitch=of_camera[2],
+    )  # fmt: skip
+    run_episodes(plan, search, out, json)
 
 
 @bench_app.command("collisions")

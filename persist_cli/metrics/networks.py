@@ -48,20 +48,19 @@ def network_weights(name: str, shapes: Shapes) -> dict[str, Tensor]:
 @lru_cache(maxsize=8)
 def _read(file: Path, shapes: tuple[tuple[str, tuple[int, ...]], ...], device: torch.device) -> dict[str, Tensor]:
     tensors, _ = read_tensors(file)
-    check_shapes(tensors, dict(shapes), file)
+    check_shapes(tensors, dict(shapes), file, f"delete {file.parent} and fetch the weights again")
     return {name: tensor.float().to(device) for name, tensor in tensors.items()}
 
 
-def check_shapes(tensors: Mapping[str, Tensor], shapes: Shapes, file: Path) -> None:
+def check_shapes(tensors: Mapping[str, Tensor], shapes: Shapes, file: Path, advice: str) -> None:
     """Raise ``CheckpointError`` naming the file and the first tensor that is missing, of another shape or unknown."""
-    again = f"delete {file.parent} and fetch the weights again"
     for name, shape in shapes.items():
         file_shape = tuple(tensors[name].shape) if name in tensors else "none"
         if file_shape != shape:
-            raise CheckpointError(f"{file}: tensor {name!r} is {file_shape}, wanted {shape}; {again}")
+            raise CheckpointError(f"{file}: tensor {name!r} is {file_shape}, wanted {shape}; {advice}")
     unknown = sorted(set(tensors) - set(shapes))
     if unknown:
-        raise CheckpointError(f"{file}: unknown tensor {unknown[0]!r}; {again}")
+        raise CheckpointError(f"{file}: unknown tensor {unknown[0]!r}; {advice}")
 
 
 @contextmanager

@@ -21,8 +21,9 @@ from torch import Tensor
 from persist_cli import __version__
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import file_sha256, read_tensors, write_json, write_tensors, written_aside
+from persist_cli.metrics.networks import check_shapes
 from persist_cli.weights.catalog import Archive, Weight
-from persist_cli.weights.conversion import CARDS, CONFIGS, CONVERSIONS
+from persist_cli.weights.conversion import CARDS, CONFIGS, CONVERSIONS, SHAPES
 from persist_cli.weights.weight_sources import WeightFile
 
 MODEL: Final = "model.safetensors"
@@ -152,7 +153,9 @@ def _convert(weight: Weight, file: WeightFile, folder: Path) -> Provenance:
 
 def _copy(weight: Weight, file: WeightFile, folder: Path) -> Provenance:
     sha256 = check_file(weight, file.path)
-    read_tensors(file.path)  # raises unless it is safetensors, and whole
+    tensors, _ = read_tensors(file.path)  # raises unless it is safetensors, and whole
+    if weight.name in SHAPES:
+        check_shapes(tensors, SHAPES[weight.name](), file.path, f"it is not {weight.title}")
     shutil.copyfile(file.path, folder / MODEL)
     if file.config is not None:
         shutil.copyfile(file.config, folder / "config.json")

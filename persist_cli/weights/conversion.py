@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from persist_cli.errors import CheckpointError
+from persist_cli.metrics import dreamsim
 from persist_cli.metrics.lpips import ALEX, VGG
 from persist_cli.weights.nomad import our_names, write_nomad_card
 from persist_cli.weights.onnx import linear_weights, read_onnx_weights
@@ -164,5 +165,8 @@ CONVERSIONS: Final[dict[str, Callable[[Path], Tensors]]] = {
 }
 
 CONFIGS: Final[dict[str, dict[str, object]]] = {"dinov2-s-derived": DINO_CONFIG}
+
+# of what is taken as it is, and no hash is known of
+SHAPES: Final[dict[str, Callable[[], dict[str, tuple[int, ...]]]]] = {"dreamsim": dreamsim.tensor_shapes}
 
 CARDS: Final[dict[str, Callable[[Path], None]]] = {"nomad": write_nomad_card}  # of policies, beside their weights

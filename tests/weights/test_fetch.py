@@ -9,6 +9,8 @@ import torch
 from persist_cli.errors import CheckpointError, PersistError
 from persist_cli.io.files import read_tensors
 from persist_cli.io.hub import cached_weight, weights_home
+from persist_cli.metrics import dreamsim
+from persist_cli.weights import cache
 from persist_cli.weights.catalog import WEIGHTS, HubRepository
 from persist_cli.weights.conversion import CONVERSIONS
 from persist_cli.weights.fetch import fetch_weight, run_fetch
@@ -84,16 +86,34 @@ def test_a_weight_of_another_cache_is_copied_when_its_tensors_are_the_known_ones
         fetch_weight(changed, tmp_path / "new", offline=True)
 
 
-def test_only_a_folder_with_the_name_of_the_weight_may_hold_it_directly(tmp_path):
+def test_only_a_folder_with_the_name_of_the_weight_may_hold_it_directly(tmp_path, monkeypatch):
     from safetensors.torch import save_file
 
+    monkeypatch.setattr(dreamsim, "WIDTH", 4)
+    tensors = {name: torch.ones(shape) for name, shape in dreamsim.tensor_shapes().items()}
     for name in ("dreamsim", "another"):
         (tmp_path / name).mkdir()
-        save_file({"a": torch.ones(2)}, tmp_path / name / "model.safetensors")
+        save_file(tensors, tmp_path / name / "model.safetensors")
     with pytest.raises(PersistError, match=r"another: not there; neither hub nor package index has it"):
         fetch_weight(WEIGHTS["dreamsim"], tmp_path / "another", offline=True)
     fetch_weight(WEIGHTS["dreamsim"], tmp_path / "dreamsim", offline=True)
-    assert torch.equal(read_tensors(cached_weight("dreamsim") / "model.safetensors")[0]["a"], torch.ones(2))
+    assert read_tensors(cached_weight("dreamsim") / "model.safetensors")[0].keys() == tensors.keys()
+
+
+@pytest.mark.parametrize(
+    ("tensors", "cause"),
+    [({"a": (2,)}, r"tensor 'cls_token' is none, wanted \(1, 1, 768\)"),
+     (dreamsim.tensor_shapes() | {"norm.bias": (2,)}, r"tensor 'norm.bias' is \(2,\), wanted \(768,\)"),
+     (dreamsim.tensor_shapes() | {"more": (2,)}, "unknown tensor 'more'")],
+)  # fmt: skip
+def test_weights_of_another_network_without_a_known_hash_are_refused(tmp_path, monkeypatch, tensors, cause):
+    folder, held = tmp_path / "dreamsim", {name: torch.empty(shape, device="meta") for name, shape in tensors.items()}
+    folder.mkdir()
+    (folder / "model.safetensors").touch()
+    monkeypatch.setattr(cache, "read_tensors", lambda path: (held, {}))
+    with pytest.raises(CheckpointError, match=rf"dreamsim/model.safetensors: {cause}; it is not DreamSim dino_vitb16$"):
+        fetch_weight(WEIGHTS["dreamsim"], folder, offline=True)
+    assert cached_weight("dreamsim") is None
 
 
 def test_a_transformers_folder_is_copied_with_its_configuration(directory, capsys):
