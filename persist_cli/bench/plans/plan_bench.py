@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from persist_cli.api.checkpoint import PLAIN, Checkpoint, find_checkpoint
+from persist_cli.api.checkpoint import PLAIN, REFERENCE, Checkpoint, find_checkpoint
 from persist_cli.api.cost import Cost
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.policy import Policy
@@ -200,7 +200,9 @@ def prepare(plan: BenchPlan, out: Path, processes: Processes) -> PlanningBench:
     check_policies(rows, policies, plan.planning.horizon)
     check_options(plan, rows, cost)
     check_row_folders(rows)
-    checkpoint = find_checkpoint(plan.checkpoint) if any(row.uses_world_model for row in rows) else None
+    uses_model, named = any(row.uses_world_model for row in rows), plan.checkpoint != Path(REFERENCE)
+    found = find_checkpoint(plan.checkpoint) if uses_model or named else None
+    checkpoint = found if uses_model else None
     journal = PlanningJournal(out)
     if processes.main:
         values = identity(plan, rows, cost, checkpoint, policies[plan.policy])
