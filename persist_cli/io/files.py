@@ -50,7 +50,11 @@ SAFETENSORS_TYPES: Final = {  # the format's names for those of torch
 
 @contextlib.contextmanager
 def written_aside(path: Path) -> Iterator[Path]:
-    """A temporary path in the same folder that becomes ``path`` when the block ends well."""
+    """A temporary path in the same folder that becomes ``path`` when the block ends well.
+
+    When it does not, folders that were made for it are removed again, unless something else is in them by then.
+    """
+    made = [folder for folder in path.parents if not folder.exists()]
     path.parent.mkdir(parents=True, exist_ok=True)
     aside = _path_aside(path)
     try:
@@ -58,8 +62,12 @@ def written_aside(path: Path) -> Iterator[Path]:
         with aside.open("rb") as file:
             os.fsync(file.fileno())
         aside.replace(path)
-    finally:
+    except BaseException:
         aside.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            for folder in made:
+                folder.rmdir()
+        raise
 
 
 def write_text(path: Path, text: str) -> None:

@@ -137,6 +137,18 @@ def test_only_leftovers_of_the_given_name_are_removed(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["m"]
 
 
+def test_a_failed_write_leaves_no_folder_that_was_made_for_it_and_every_other(tmp_path):
+    (tmp_path / "there").mkdir()
+    for place in ("new/deep/a.txt", "there/a.txt"):
+        with pytest.raises(RuntimeError), written_aside(tmp_path / place):
+            raise RuntimeError
+    with pytest.raises(FileNotFoundError), written_aside(tmp_path / "shared/deep/a.txt"):
+        (tmp_path / "shared" / "of another").touch()
+    assert sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")) == [
+        "shared", "shared/of another", "there"
+    ]  # fmt: skip
+
+
 def test_a_folder_written_aside_replaces_the_old_one_only_when_it_is_whole(tmp_path):
     for text in ("old", "new"):
         with folder_aside(tmp_path / "m") as folder:
