@@ -136,8 +136,8 @@ def export_policy(plan: ExportPlan, out: Path, json: bool) -> None:
     """
     policy = find_policy(plan.checkpoint)
     with _network_folder(plan, policy.folder, "a policy", out) as folder:
-        write_policy_card(folder, policy.policy, policy.settings, policy.training_scenes)
-    _print_files(out, {"policy": policy.policy, "dtype": plan.dtype}, _summed_files(out), json)
+        write_policy_card(folder, policy.plugin, policy.settings, policy.training_scenes)
+    _print_files(out, {"policy": policy.plugin, "dtype": plan.dtype}, _summed_files(out), json)
 
 
 def export_scene_model(plan: ExportPlan, out: Path, json: bool) -> None:

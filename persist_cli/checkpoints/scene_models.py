@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from persist_cli.api.checkpoint import SCENE_CARD
 from persist_cli.api.meta_device import without_weights
-from persist_cli.api.network_card import CardKind, card_folder, find_card, write_card
+from persist_cli.api.network_card import CardKind, NetworkCard, card_folder, find_card, write_card
 from persist_cli.api.scene_model import SceneForm, SceneModel
 from persist_cli.api.stages import SCENE_STAGES, Stage
 from persist_cli.api.training_scenes import TrainingScenes
@@ -28,26 +28,14 @@ SCENE: Final = CardKind(SCENE_CARD, "persist-scene-model", "scene", "model of sc
 
 
 @dataclass(frozen=True)
-class TrainedSceneModel:
+class TrainedSceneModel(NetworkCard):
     """A trained model of scenes on disk; its weights are not loaded yet.
 
     Args:
-        folder: the folder of ``scene.json``.
-        name: the name of the run or folder, which tables show.
-        plugin: the name of its plugin.
-        settings: the plain settings of the model.
         stage: the last stage that trained it; after ``scene-codec`` it cannot sample yet.
-        fingerprint: a hash of its weights.
-        training_scenes: the scenes that it was trained on; ``None`` where that is not known.
     """
 
-    folder: Path
-    name: str
-    plugin: str
-    settings: dict[str, Any]
     stage: Stage
-    fingerprint: str
-    training_scenes: TrainingScenes | None
 
     @property
     def form(self) -> SceneForm:
@@ -126,9 +114,7 @@ def find_scene_model(path: str | Path) -> TrainedSceneModel:
     stage = card.values.get("stage")
     if stage not in SCENE_STAGES:
         raise CheckpointError(f"{card.folder / SCENE_CARD}: its stage is {stage!r}; known: {', '.join(SCENE_STAGES)}")
-    return TrainedSceneModel(
-        card.folder, card.name, card.plugin, card.settings, stage, card.fingerprint, card.training_scenes
-    )  # fmt: skip
+    return TrainedSceneModel(**vars(card), stage=stage)
 
 
 def packaged_scene_model() -> str | None:

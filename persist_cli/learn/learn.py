@@ -198,7 +198,7 @@ def prepare(plan: LearnPlan, out: Path) -> Learning:
 def identity(learning: Learning) -> dict[str, Any]:
     """Return JSON values of all that changes what is learned: a learning with equal values goes on."""
     plan, begin = learning.plan, learning.begin
-    acts = acting_settings(make_settings("policy", begin.policy, {}))
+    acts = acting_settings(make_settings("policy", begin.plugin, {}))
     values = asdict(plan) | {
         "policy": {"fingerprint": begin.fingerprint, "settings": acts},
         "checkpoint": None, "episodes": None, "rounds": None,
@@ -355,7 +355,7 @@ def recipe_of_round(plan: LearnPlan, before: TrainedPolicy, number: int) -> dict
     """Return the plain values of the recipe by which the policy of the round before is fine-tuned."""
     return {
         "stage": "policy", "description": f"round {number} of a policy that practises", "base": str(before.folder),
-        "policy": {"name": before.policy, "settings": before.settings}, "data": {"detour": DETOUR},
+        "policy": {"name": before.plugin, "settings": before.settings}, "data": {"detour": DETOUR},
         "training": {"steps": plan.steps, "seed": plan.seed, "precision": "no", "learning_rate": 1e-4, "warmup": 20,
                      "batch": 64, "ema": 0.99},
     }  # fmt: skip

@@ -32,7 +32,7 @@ def open_policy(text: str, settings: Mapping[str, Any] | None = None) -> Policy:
         if "checkpoint" in settings:
             raise PersistError(f"{text}: a trained policy; leave out policy.checkpoint, or name its plugin instead")
         trained = find_policy(Path(text))
-        return make_policy(trained.policy, {**settings, "checkpoint": str(trained.folder)})
+        return make_policy(trained.plugin, {**settings, "checkpoint": str(trained.folder)})
     names = sorted({plugin.name for plugin in list_plugins("policy")})
     raise PluginError(f"unknown policy {text!r}; {hint(text, names, 'installed')} (or the folder of a trained one)")
 

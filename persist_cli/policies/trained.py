@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from persist_cli.api.checkpoint import POLICY_CARD
-from persist_cli.api.network_card import CardKind, card_folder, find_card, write_card
+from persist_cli.api.network_card import CardKind, NetworkCard, card_folder, find_card, write_card
 from persist_cli.api.policy_network import PolicyNetwork
 from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.errors import CheckpointError
@@ -25,24 +25,8 @@ POLICY: Final = CardKind(POLICY_CARD, "persist-policy", "policy", "trained polic
 
 
 @dataclass(frozen=True)
-class TrainedPolicy:
-    """A trained policy on disk; its weights are not loaded yet.
-
-    Args:
-        folder: the folder of ``policy.json``.
-        name: the name of the run or folder, which tables show.
-        policy: the name of its plugin.
-        settings: the plain settings of its network.
-        fingerprint: a hash of its weights.
-        training_scenes: the scenes that it was trained on; ``None`` where that is not known.
-    """
-
-    folder: Path
-    name: str
-    policy: str
-    settings: dict[str, Any]
-    fingerprint: str
-    training_scenes: TrainingScenes | None
+class TrainedPolicy(NetworkCard):
+    """A trained policy on disk; its weights are not loaded yet."""
 
     def load(self) -> PolicyNetwork:
         """Return the network with its weights, ready to act.
@@ -51,7 +35,7 @@ class TrainedPolicy:
             CheckpointError: when a file is missing or damaged, or does not fit.
         """
         check_sums(self.folder)
-        network = make_network(self.policy, self.settings)
+        network = make_network(self.plugin, self.settings)
         network.load(self.folder)
         return network.eval()
 
@@ -98,10 +82,7 @@ def find_policy(path: Path) -> TrainedPolicy:
     Raises:
         CheckpointError: when there is none, or its card is damaged.
     """
-    card = find_card(POLICY, path)
-    return TrainedPolicy(
-        card.folder, card.name, card.plugin, card.settings, card.fingerprint, card.training_scenes
-    )  # fmt: skip
+    return TrainedPolicy(**vars(find_card(POLICY, path)))
 
 
 def is_policy(path: Path) -> bool:

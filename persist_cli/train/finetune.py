@@ -244,8 +244,8 @@ def prepare_policy(recipe: Recipe, run: Path, plan: FinetunePlan) -> tuple[Polic
     if not steps and recipe.base is None:
         return network, TrainingScenes()
     begun = find_policy(steps[-1] if steps else Path(str(recipe.base)))
-    if begun.policy != recipe.policy.name:
-        raise RecipeError(f"base {recipe.base} is of policy {begun.policy!r}, not {recipe.policy.name!r}")
+    if begun.plugin != recipe.policy.name:
+        raise RecipeError(f"base {recipe.base} is of policy {begun.plugin!r}, not {recipe.policy.name!r}")
     if not steps:
         network.load(begun.folder)
     return network, begun.training_scenes or TrainingScenes(complete=False)

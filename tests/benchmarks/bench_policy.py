@@ -44,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parse(arguments)
     trained = packaged_policy() if options.policy is None else find_policy(options.policy)
     network = trained.load()
-    assert isinstance(network, NomadNetwork), f"{trained.folder}: of policy {trained.policy!r}, not 'nomad'"
+    assert isinstance(network, NomadNetwork), f"{trained.folder}: of policy {trained.plugin!r}, not 'nomad'"
     data = options.data or [sample_data()]
     samples = moments(network, data, options.moments, options.seed)
     others = torch.randperm(len(samples.goal), generator=torch.Generator().manual_seed(options.seed))

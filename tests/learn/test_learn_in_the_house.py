@@ -146,7 +146,7 @@ def test_a_house_that_the_policy_was_trained_on_is_evaluated_only_where_that_is_
     (scene,) = EpisodeSet.model_validate_json(episodes.read_text()).scenes
     known = Path(shutil.copytree(find_policy(policy_run).folder, tmp_path / "known"))
     trained = find_policy(known)
-    write_policy_card(known, trained.policy, trained.settings, TrainingScenes(frozenset({scene})))
+    write_policy_card(known, trained.plugin, trained.settings, TrainingScenes(frozenset({scene})))
     write_sums(known)
     result = learn("--policy", known, "--stop-cost", 0)
     assert (result.code, result.err.count("\n")) == (1, 1)

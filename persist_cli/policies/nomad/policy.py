@@ -76,7 +76,7 @@ class NomadPolicy(Policy):
         trained = packaged_policy() if settings.checkpoint is None else find_policy(Path(settings.checkpoint))
         network = trained.load()
         if not isinstance(network, NomadNetwork):
-            raise CheckpointError(f"{trained.folder}: is of policy {trained.policy!r}, not 'nomad'")
+            raise CheckpointError(f"{trained.folder}: is of policy {trained.plugin!r}, not 'nomad'")
         levels = network.settings.noise_levels
         if settings.steps is not None and settings.steps > levels:
             raise RecipeError(f"policy 'nomad': steps {settings.steps}; {trained.folder} has {levels} noise levels")
