@@ -164,7 +164,7 @@ def walk_houses(plan: CollisionPlan, size: tuple[int, int], checkpoint: Checkpoi
     Raises:
         DataError: when the model was trained on one of the scenes.
     """
-    simulator = checked_simulator(plan.scenes.simulator, {"height": size[0], "width": size[1]})
+    simulator = checked_simulator(plan.scenes.simulator, plan.scenes.settings | {"height": size[0], "width": size[1]})
     known, seeds = scenes_to_avoid([checkpoint]), plan.scenes.generator_seeds
     houses = []
     with progress() as bar:
@@ -364,6 +364,7 @@ def collision_json(
         "fingerprint": checkpoint.fingerprint,
         "sampling": dataclasses.asdict(sampling),
         "simulator": plan.scenes.simulator,
+        "settings": plan.scenes.settings,
         "scenes": [walks[0].info.scene for walks in houses],
         "walks": plan.walks,
         "actions": plan.actions,

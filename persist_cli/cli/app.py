@@ -14,38 +14,29 @@ import typer
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.cli.bench import bench_app
 from persist_cli.cli.catalog import catalog_app
+from persist_cli.cli.measuring import measuring_app
 from persist_cli.cli.options import (
-    DEFAULT_CONTROLS,
     ActionsOption,
     BodyOption,
-    CheckpointsArgument,
     Commands,
-    CompareOption,
     ContextNoiseOption,
-    ControlsOption,
     DtypeOption,
     GuidanceOption,
     HoldOutOption,
     JsonOption,
-    MemoriesOption,
-    NewPosesOption,
     ReferenceArgument,
-    ResampleOption,
     SamplerOption,
-    SamplingOfOption,
     SaveMemoryOption,
+    SimulatorSettingsOption,
     SkipBadOption,
     StepOption,
     StepsOption,
     StoredTurnOption,
-    TrainingScenesOption,
-    TrainingSeedsOption,
     TurnOption,
     VerifyOption,
     limit_spinning,
     refuse_other_options,
     show_version,
-    split_names,
 )
 from persist_cli.cli.planning import planning_app
 from persist_cli.cli.playing import playing_app
@@ -61,6 +52,7 @@ app = typer.Typer(
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
 )
+app.add_typer(measuring_app)
 app.add_typer(catalog_app)
 app.add_typer(planning_app)
 app.add_typer(bench_app, name="bench")
@@ -116,6 +108,7 @@ def collect(
     light: Annotated[str, typer.Option(help="Factor of the brightness, as in 0.6:1.2.")] = "1",
     tint: Annotated[str, typer.Option(help="Largest change of a colour channel, as in 0.15.")] = "0",
     depth_sensor: Annotated[str, typer.Option(help="exact, or kinect: noisy, in steps, with holes.")] = "exact",
+    settings: SimulatorSettingsOption = None,
     workers: Annotated[int, typer.Option(min=0, help="Processes; 0 for one a core.")] = 0,
     json: JsonOption = False,
 ) -> None:
@@ -125,11 +118,13 @@ def collect(
 
     persist collect miniworld --out runs/cameras --scenes 0:100 --fov 45:90 --height 0.6:1.7 --pitch -25:10 --turn 5:20
     """
+    from persist_cli.recipe import apply_overrides
     from persist_cli.simulators.collect import CollectPlan, run_collect
 
     plan = CollectPlan(
         simulator=simulator, scenes=scenes, frames=frames, size=size, seed=seed, split=split, policy=policy,
         step=step, turn=turn, fov=fov, height=height, pitch=pitch, light=light, tint=tint, depth_sensor=depth_sensor,
+        settings=apply_overrides({}, settings or ()),
     )  # fmt: skip
     run_collect(plan, out, workers, json)
 
@@ -367,82 +362,3 @@ def rollout(
         world=world, actions=tuple(actions or ()), follow=follow, frames=frames, step=step, turn=turn
     )  # fmt: skip
     run_rollout(checkpoint, plan, out, json)
-
-
-@app.command("eval")
-def evaluate(
-    context: typer.Context,
-    checkpoints: CheckpointsArgument = None,
-    data: Annotated[list[Path] | None, typer.Option(help="Data set of held-out scenes; may be given again.")] = None,
-    protocol: Annotated[str, typer.Option(help="revisit, return, long, unseen or later.")] = "revisit",
-    memories: MemoriesOption = None,
-    controls: ControlsOption = None,
-    metrics: Annotated[str, typer.Option(help="Metrics separated by commas, or all.")] = "all",
-    frames: Annotated[int, typer.Option(min=0, help="Frames of a clip, the given one included; 0: protocol's.")] = 0,
-    clips: Annotated[int, typer.Option(min=1, help="Most clips to use.")] = 32,
-    seeds: Annotated[int, typer.Option(min=1, help="Sampling seeds.")] = 3,
-    steps: StepsOption = None,
-    sampler: SamplerOption = None,
-    guidance: GuidanceOption = None,
-    context_noise: ContextNoiseOption = None,
-    sampling_of: SamplingOfOption = None,
-    dtype: DtypeOption = None,
-    save_memory: SaveMemoryOption = None,
-    verify: VerifyOption = False,
-    batch: Annotated[int, typer.Option(min=1, help="Clips denoised at once.")] = 8,
-    pose_noise: Annotated[tuple[float, float], typer.Option(help="Of noisy and drifting: σ in cm, degrees.")] = (5, 2),
-    training_seeds: TrainingSeedsOption = False,
-    new_poses: NewPosesOption = (0.2, 10.0),
-    allow_training_scenes: TrainingScenesOption = False,
-    resample: ResampleOption = "scenes",
-    out: Annotated[Path, typer.Option(help="Folder of all results; a stopped run goes on.")] = Path("runs/eval"),
-    report: Annotated[Path | None, typer.Option(help="Folder for report.html, tables, curves, clips.")] = None,
-    compare: CompareOption = None,
-    json: JsonOption = False,
-) -> None:
-    """Compare checkpoints, memories and controls on equal clips of held-out scenes, or two results (--compare).
-
-    persist eval runs/none runs/voxel --data runs/houses-test --memories none,voxel --report runs/report
-    """
-    if compare is not None:
-        return compare_results(context, compare, json, report)
-    from persist_cli.evaluate.evaluate import run_eval
-    from persist_cli.evaluate.new_poses import NewPoses
-    from persist_cli.evaluate.plan import EvalPlan
-
-    plan = EvalPlan(
-        data=tuple(data or []), metrics=split_names(metrics), frames=frames, clips=clips, seeds=seeds,
-        memories=None if memories is None else split_names(memories), controls_named=controls is not None, batch=batch,
-        controls=split_names(DEFAULT_CONTROLS if controls is None else controls), noise=pose_noise, resample=resample,
-        sampling=SamplingOverrides(steps, sampler, guidance, context_noise), training_seeds=training_seeds,
-        sampling_of=SamplingOverrides.by_memory(sampling_of or ()), allow_training_scenes=allow_training_scenes,
-        placement=InferenceOptions.of(dtype, save_memory), new_poses=NewPoses(*new_poses), protocol=protocol,
-    )  # fmt: skip
-    run_eval(checkpoints or [], plan, out, report, json)
-
-
-def compare_results(context: typer.Context, files: tuple[Path, Path], json: bool, report: Path | None) -> None:
-    """Compare two files of results."""
-    refuse_other_options(context, "compare json report", "not with --compare, which takes results as they are")
-    from persist_cli.evaluate.report.compare import run_compare
-
-    run_compare(*files, json, report)
-
-
-@app.command(context_settings={"allow_interspersed_args": True})
-def doctor(
-    recipe: Annotated[str, typer.Argument(help="A recipe's name (`persist recipes`) or a YAML file.")],
-    overrides: Annotated[list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Settings to change.")] = None,
-    gpus: Annotated[int | None, typer.Option(min=1, help="Plan for so many GPUs; else for what is here.")] = None,
-    gpu_memory: Annotated[float | None, typer.Option(min=0.001, help="GiB of each: 80 for a card of 80 GB.")] = None,
-    fsdp: Annotated[bool, typer.Option("--fsdp", help="Plan with FSDP2 over the GPUs.")] = False,
-    json: JsonOption = False,
-) -> None:
-    """Say how much memory a training needs, whether it fits, and the smallest change that makes it fit.
-
-    persist doctor cogvideox-5b-i2v-stage1 --gpus 8 --gpu-memory 80
-    """
-    from persist_cli.doctor.doctor import run_doctor
-    from persist_cli.doctor.machine import machine_of
-
-    run_doctor(recipe, overrides or [], machine_of(gpus, gpu_memory), fsdp, json)

@@ -17,6 +17,7 @@ from persist_cli.cli.options import (
     JsonOption,
     SamplerOption,
     SaveMemoryOption,
+    SimulatorSettingsOption,
     StepsOption,
     TrainingScenesOption,
     VerifyOption,
@@ -75,6 +76,7 @@ def bench_episodes(
     fov: Annotated[float | None, typer.Option(help="Degrees of view from top to bottom; 75 in miniworld.")] = None,
     height: Annotated[float | None, typer.Option(help="Metres of the camera above the floor; 1.25.")] = None,
     pitch: Annotated[float | None, typer.Option(help="Degrees that the camera looks up; 0.")] = None,
+    settings: SimulatorSettingsOption = None,
     bins: Annotated[str, typer.Option(help="Actions of the shortest ways, separated by commas.")] = "8,16,32,64",
     each: Annotated[int, typer.Option(min=1, help="Most of each bin, in sight and hidden.")] = 16,
     per_scene: Annotated[int, typer.Option(min=1, help="Most of each of these in one scene.")] = 1,
@@ -92,6 +94,7 @@ def bench_episodes(
     """
     from persist_cli.episodes.find_episodes import EpisodeSearch
     from persist_cli.episodes.make_episodes import run_episodes
+    from persist_cli.recipe import apply_overrides
     from persist_cli.simulators.collect import CollectPlan
 
     search = EpisodeSearch(
@@ -101,7 +104,7 @@ def bench_episodes(
     of_camera = [None if value is None else str(value) for value in (fov, height, pitch)]
     plan = CollectPlan(
         simulator=simulator, scenes=scenes, size=size, split=split, step=str(step), turn=str(turn), fov=of_camera[0],
-        height=of_camera[1], pitch=of_camera[2],
+        height=of_camera[1], pitch=of_camera[2], settings=apply_overrides({}, settings or ()),
     )  # fmt: skip
     run_episodes(plan, search, out, json)
 
@@ -113,6 +116,7 @@ def bench_collisions(
     simulator: Annotated[str, typer.Option(help="A simulator; `persist plugins` lists them.")] = "miniworld",
     scenes: Annotated[str, typer.Option(help="Scene seeds A:B, B not included.")] = "0:12",
     split: Annotated[str, typer.Option(help="train, validation or test: they share no scene.")] = "test",
+    settings: SimulatorSettingsOption = None,
     walks: Annotated[int, typer.Option(min=1, help="Random walks in each scene.")] = 4,
     actions: Annotated[int, typer.Option(min=1, help="Actions of each walk that the simulator allows.")] = 24,
     memories: Annotated[str | None, typer.Option(help="Of the checkpoint, with commas; else default and none.")] = None,
@@ -131,10 +135,13 @@ def bench_collisions(
     persist bench collisions --scenes 0:12 --memories voxel,none --out runs/collisions.json
     """
     from persist_cli.bench.collisions import CollisionPlan, run_collisions
+    from persist_cli.recipe import apply_overrides
     from persist_cli.simulators.collect import CollectPlan
 
     plan = CollisionPlan(
-        scenes=CollectPlan(simulator=simulator, scenes=scenes, split=split, seed=seed), walks=walks, actions=actions,
+        scenes=CollectPlan(
+            simulator=simulator, scenes=scenes, split=split, seed=seed, settings=apply_overrides({}, settings or ())
+        ), walks=walks, actions=actions,
         memories=None if memories is None else split_names(memories),
         sampling=SamplingOverrides(steps, sampler, guidance, context_noise),
         placement=InferenceOptions.of(dtype, save_memory),

@@ -44,6 +44,10 @@ PlanSettingsOption = Annotated[
     typer.Option("--set", help="As in method.elites=0.1, policy.KEY=VALUE or cost.KEY=VALUE."),
 ]
 
+SimulatorSettingsOption = Annotated[
+    list[str] | None, typer.Option("--set", help="Of the simulator, where no option has it: radius=0.15.")
+]
+
 CemSettingsOption = Annotated[
     list[str] | None, typer.Option("--set", help="Of cem, as in method.elites=0.1 or method.kept=0.3.")
 ]

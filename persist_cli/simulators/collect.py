@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
 from operator import attrgetter
 from pathlib import Path
@@ -50,7 +50,9 @@ OPEN_WAY = 1.0  # metres that must be free in front of a start
 AGENT_OPTIONS = {"step": "step", "turn": "turn", "fov": "fov", "height": "camera_height", "pitch": "pitch"}
 
 # options that the plans of earlier versions lack, with the value that stands for their absence
-LATER = {"fov": None, "height": None, "pitch": None, "light": 1.0, "tint": 0.0, "depth_sensor": "exact"}
+LATER: dict[str, Any] = {
+    "fov": None, "height": None, "pitch": None, "light": 1.0, "tint": 0.0, "depth_sensor": "exact", "settings": {},
+}  # fmt: skip
 
 LIMITS = {"step": (0.01, 10.0), "turn": (0.1, 180.0), "light": (0.05, 4.0), "tint": (0.0, 0.9)}  # of both ends
 
@@ -79,6 +81,7 @@ class CollectPlan:
         light: factor of the brightness.
         tint: largest relative change of a colour channel.
         depth_sensor: a name in ``SENSORS``.
+        settings: further ones of the simulator, which no option stands for.
     """
 
     simulator: str
@@ -96,6 +99,7 @@ class CollectPlan:
     light: str = "1"
     tint: str = "0"
     depth_sensor: str = "exact"
+    settings: dict[str, Any] = field(default_factory=dict)
 
     def check(self) -> None:
         """Raise ``PersistError`` with one line for the first option that cannot be used."""
@@ -126,7 +130,9 @@ class CollectPlan:
         known = [field.name for field in dataclasses.fields(settings_type) if field.init]
         options = {"height": "size", "width": "size"} | {setting: name for name, setting in AGENT_OPTIONS.items()}
         for setting in self.agent_settings(attrgetter("low")):
-            if setting not in known:
+            if setting in self.settings and setting in options:
+                raise DataError(f"--set {setting}: give --{options[setting]}")
+            if setting not in known and setting not in self.settings:
                 raise DataError(
                     f"simulator {self.simulator!r} has no --{options[setting]}: there is no {setting!r} among its "
                     f"settings ({', '.join(known) or 'it has none'})"
@@ -144,7 +150,7 @@ class CollectPlan:
             text = getattr(self, option)
             if text is not None:
                 drawn[setting] = value(Range.parse(f"--{option}", text))
-        return {"height": height, "width": width} | drawn
+        return self.settings | {"height": height, "width": width} | drawn
 
     def to_json(self) -> dict[str, Any]:
         """The settings that a folder keeps: scenes may grow, and what is left at its default is as it always was."""
@@ -267,6 +273,7 @@ def scene_look(plan: CollectPlan, seed: int) -> Look:
 def camera_source(plan: CollectPlan, seed: int, simulator: Simulator) -> dict[str, Any]:
     """What a trajectory's source says of its camera beyond intrinsics and actions; nothing where all is default."""
     drawn = [setting for option, setting in AGENT_OPTIONS.items() if option in LATER and getattr(plan, option)]
+    drawn += plan.settings
     camera = {setting: getattr(simulator.settings, setting) for setting in drawn}
     look = scene_look(plan, seed)
     if look != Look():

@@ -19,6 +19,8 @@ import torch
 
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError, PersistError
+from persist_cli.navigation.ground_mapper import body_of
+from persist_cli.planning.true_futures import simulator_settings
 from persist_cli.simulators.collect import FIRST_SEED, SPLIT_SCENES, CollectPlan, claim_folder, run_collect
 from tests.support.miniworlds import make_world
 
@@ -93,6 +95,31 @@ def test_each_scene_draws_its_own_camera_steps_and_turns(tmp_path: Path, collect
         assert float(file.poses()[0, 1, 2]) == pytest.approx(math.sin(math.radians(camera["pitch"])))
 
 
+def test_further_settings_reach_the_simulator_and_what_opens_the_scene_again(
+    tmp_path: Path, collecting_here: None
+) -> None:
+    make_world()
+    run_collect(replace(SMALL, scenes="0:1", settings={"radius": 0.15}), tmp_path, 1, json=True)
+    info = Store(tmp_path)[0].info
+    assert info.source["camera"] == {"radius": 0.15}
+    assert (body_of(info).radius, simulator_settings("miniworld", info)["radius"]) == (0.15, 0.15)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [({"radius": 9}, "radius 9.* is not between"), ({"radios": 0.15}, "did you mean 'radius'"),
+     ({"fov": 60}, "--set fov: give --fov"), ({"height": 60}, "--set height: give --size"),
+     ({"camera_height": 1}, "--set camera_height: give --height")],
+)  # fmt: skip
+def test_a_setting_that_is_none_or_has_an_option_is_refused(
+    tmp_path: Path, settings: dict[str, object], message: str
+) -> None:
+    with pytest.raises(PersistError, match=message) as caught:
+        run_collect(replace(SMALL, settings=settings), tmp_path / "out", 1, json=False)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_scene_has_the_same_camera_whichever_process_collects_it(
     tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
@@ -139,6 +166,7 @@ def test_no_two_splits_share_a_seed() -> None:
         ({"depth_sensor": "kinect"}, "was collected with depth_sensor 'exact', not 'kinect'"),
         ({"seed": 3}, "was collected with seed 0, not 3"),
         ({"policy": "path"}, "was collected with policy 'explore', not 'path'"),
+        ({"settings": {"radius": 0.15}}, r"was collected with settings \{\}, not \{'radius': 0.15\}"),
     ],
 )
 def test_a_folder_collected_with_other_options_is_refused(
