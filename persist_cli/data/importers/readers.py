@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
+import torch
 from PIL import Image, ImageOps
 
+from persist_cli.api.cameras import check_intrinsics
+from persist_cli.data.importers.lenses import Lens
 from persist_cli.errors import DataError
+
+LEAST_SKEW: Final = 1e-3  # pixels
 
 
 def read_color(path: Path) -> np.ndarray[Any, Any]:
@@ -68,6 +73,19 @@ def read_matrix(path: Path, rows: int, columns: int) -> np.ndarray[Any, Any]:
     if numbers.size != rows * columns:
         raise DataError(f"{path}: {numbers.size} numbers, not the {rows}×{columns} of the matrix")
     return numbers.reshape(rows, columns)
+
+
+def read_lens(path: Path, rows: int) -> Lens:
+    """The lens by a file's square matrix of so many rows, which counts from the centre of the top-left pixel.
+
+    Raises:
+        DataError: as ``read_matrix``, and when it is no matrix of a camera.
+    """
+    matrix = read_matrix(path, rows, rows)
+    check_intrinsics(torch.from_numpy(matrix[:3, :3]), str(path))
+    if abs(matrix[0, 1]) > LEAST_SKEW:
+        raise DataError(f"{path}: a skew of {matrix[0, 1]:g} pixels; rectify the images first")
+    return Lens.of_pixel_centres(matrix)
 
 
 def _eight_bits(image: Image.Image, path: Path) -> np.ndarray[Any, Any]:

@@ -1,0 +1,277 @@
+"""TUM RGB-D, ScanNet and nerfstudio give back the room that was written in their format, and name what is broken."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from persist_cli.api.importer import ForeignTrajectory, Importer
+from persist_cli.data.importers.importing import ImportPlan, run_import
+from persist_cli.data.importers.nerfstudio import Nerfstudio
+from persist_cli.data.importers.scannet import ScanNet
+from persist_cli.data.importers.tum import TumRgbd, poses_at, read_listing
+from persist_cli.data.store import Store
+from persist_cli.errors import DataError
+from persist_cli.plugins import load_plugin
+from tests.support.foreign_captures import ROOM, poses, write_nerfstudio, write_scannet, write_tum
+from tests.support.rooms import walk
+
+FORMATS: dict[str, tuple[type[Importer], Callable[..., Path]]] = {
+    "tum": (TumRgbd, write_tum), "scannet": (ScanNet, write_scannet), "nerfstudio": (Nerfstudio, write_nerfstudio)
+}  # fmt: skip
+EXACT = {"tum": 0.00011, "scannet": 0.00051, "nerfstudio": 0.00051}  # metres, half a unit of depth
+
+
+def read(name: str, source: Path) -> ForeignTrajectory:
+    (trajectory,) = FORMATS[name][0]().trajectories(source)
+    return trajectory
+
+
+@pytest.fixture(params=FORMATS)
+def name(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture
+def capture(name: str, tmp_path: Path) -> Path:
+    return FORMATS[name][1](tmp_path / "room")
+
+
+def test_a_capture_is_imported_as_it_was(name: str, capture: Path) -> None:
+    trajectory = read(name, capture)
+    first = 1 if name == "tum" else 0  # whose first frame has no true pose
+    truth = list(ROOM.frames(walk(24)))
+    info = trajectory.info
+    assert (trajectory.name, info.scene, info.source["format"]) == ("room", "room", name)
+    assert (info.height, info.width, info.world_up) == (48, 64, (0, 0, 1))
+    assert info.intrinsics == pytest.approx(ROOM.intrinsics)
+    frames = list(trajectory.frames)
+    assert len(frames) == trajectory.length == (5 if name == "tum" else 4)
+    for number, frame in enumerate(frames, first):
+        assert np.array_equal(frame.rgb, truth[number].rgb)
+        assert frame.depth[0, 0] == 0
+        assert np.abs(frame.depth - truth[number].depth)[1:].max() < EXACT[name]
+        assert frame.world_from_camera == pytest.approx(poses(24)[number], abs=1e-6)
+
+
+def test_an_imported_capture_can_be_inspected(name: str, capture: Path, persist: Any, tmp_path: Path) -> None:
+    imported = persist("import", name, capture, "--out", tmp_path / "out", "--json")
+    assert (imported.code, imported.err) == (0, "")
+    (row,) = json.loads(imported.out)["trajectories"]
+    assert row["world_up_is"] == "z, as the format has it"
+    inspected = persist("inspect", tmp_path / "out")
+    assert inspected.code == 0, inspected.out
+    assert "agree" in inspected.out
+
+
+def test_a_folder_of_captures_is_as_many_scenes(name: str, capture: Path, tmp_path: Path) -> None:
+    shutil.copytree(capture, tmp_path / "all/a")
+    shutil.copytree(capture, tmp_path / "all/b")
+    trajectories = list(FORMATS[name][0]().trajectories(tmp_path / "all"))
+    assert [(one.name, one.info.scene) for one in trajectories] == [("a", "a"), ("b", "b")]
+    with pytest.raises(DataError, match=r"nowhere: neither "):
+        list(FORMATS[name][0]().trajectories(tmp_path / "nowhere"))
+
+
+def test_the_importers_are_plugins(name: str) -> None:
+    assert load_plugin("importer", name) is FORMATS[name][0]
+
+
+def test_a_damaged_image_is_left_out_or_named(name: str, capture: Path, tmp_path: Path) -> None:
+    image = sorted(capture.glob("depth/*"))[2]
+    image.write_bytes(b"")
+    with pytest.raises(DataError, match=rf"{image.name}: not a whole image.*--skip-bad leaves such frames out"):
+        run_import(name, capture, tmp_path / "out", ImportPlan(), True)
+    run_import(name, capture, tmp_path / "out", ImportPlan(skip_bad=True), True)
+    assert len(Store(tmp_path / "out")[0]) == (4 if name == "tum" else 3)
+
+
+def rewrite(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    values = json.loads(path.read_text())
+    change(values)
+    path.write_text(json.dumps(values))
+
+
+# --- TUM RGB-D
+
+
+def test_tum_knows_its_own_cameras_and_no_other(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "rgbd_dataset_freiburg3_desk")
+    (folder / "camera-intrinsics.txt").unlink()
+    for path in folder.glob("*/*.png"):
+        Image.open(path).resize((640, 480), Image.Resampling.NEAREST).save(path)
+    assert read("tum", folder).info.intrinsics[:2, 2].tolist() == [320.6, 248.1]
+    folder.rename(tmp_path / "desk")
+    with pytest.raises(DataError, match=r"desk/camera-intrinsics.txt: no such file, and the folder's name says none"):
+        read("tum", tmp_path / "desk")
+
+
+def test_tum_undoes_the_distortion_of_its_first_camera(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "rgbd_dataset_freiburg1_desk", 3)
+    (folder / "camera-intrinsics.txt").unlink()
+    for path in folder.glob("*/*.png"):
+        Image.open(path).resize((640, 480), Image.Resampling.NEAREST).save(path)
+    stored = np.array(Image.open(sorted(folder.glob("rgb/*"))[1]))
+    frame = next(read("tum", folder).frames)
+    assert np.abs(frame.rgb[250:260, 310:330].astype(int) - stored[250:260, 310:330]).mean() < 2  # the middle stays
+    assert np.abs(frame.rgb[:60, :60].astype(int) - stored[:60, :60]).mean() > 10
+
+
+def test_tum_poses_are_interpolated_between_true_ones_that_are_near(tmp_path: Path) -> None:
+    turns = Rotation.from_rotvec(np.array([[0, 0, 0], [0, 0, 90], [0, 0, 90], [0, 0, 90]]), degrees=True).as_quat()
+    lines = [f"{time} {x} 0 0 {' '.join(map(str, turn))}" for time, x, turn in
+             zip((1.0, 1.02, 1.5, 1.51), (0, 1, 1, 2), turns, strict=True)]  # fmt: skip
+    path = tmp_path / "groundtruth.txt"
+    path.write_text("\n".join(reversed(lines)))
+    found = poses_at(np.array([0.99, 1.0, 1.005, 1.03, 1.5, 1.505, 1.52]), read_listing(path, 7), path)
+    assert [pose is None for pose in found] == [True, False, False, True, False, False, True]
+    assert found[2][:3, 3] == pytest.approx([0.25, 0, 0])
+    assert Rotation.from_matrix(found[2][:3, :3]).as_euler("zyx", degrees=True) == pytest.approx([22.5, 0, 0])
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "cause"),
+    [
+        ("rgb.txt", None, "rgb.txt: no such file|neither rgb.txt"),
+        ("depth.txt", None, "depth.txt: no such file"),
+        ("depth.txt", "1305031102.0", "depth.txt: line 1 is not a time and 1 word: '1305031102.0'"),
+        ("rgb.txt", "soon rgb/a.png", "rgb.txt: line 1 is not a time and 1 word"),
+        ("groundtruth.txt", "1.0 0 0 0 0 0 1", "groundtruth.txt: line 1 is not a time and 7 words"),
+        ("groundtruth.txt", "1.0 0 0 0 0 0 0 1", "groundtruth.txt: 1 true poses, too few"),
+        ("groundtruth.txt", "1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 0 0", "groundtruth.txt: not poses tx ty tz qx qy qz qw"),
+        ("groundtruth.txt", "1.0 0 0 0 0 0 0 1\n2.0 0 0 nan 0 0 0 1", "groundtruth.txt: not poses.*not finite"),
+        (
+            "groundtruth.txt",
+            "1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 0 1",
+            "no colour image has a depth image and a true pose",
+        ),
+        ("depth.txt", "# none", "no colour image has a depth image and a true pose"),
+        ("rgb.txt", "# none", "no colour image has a depth image and a true pose"),
+        ("camera-intrinsics.txt", "500 9 32 0 500 24 0 0 1", "a skew of 9 pixels; rectify the images first"),
+    ],
+)
+def test_a_broken_tum_recording_is_one_line(tmp_path: Path, file: str, text: str | None, cause: str) -> None:
+    folder = write_tum(tmp_path / "room", 3)
+    (folder / file).unlink()
+    if text is not None:
+        (folder / file).write_text(text)
+    with pytest.raises(DataError, match=cause) as caught:
+        read("tum", folder)
+    assert "\n" not in str(caught.value)
+
+
+# --- ScanNet
+
+
+def test_frames_of_scannet_without_tracking_are_left_out_or_named(tmp_path: Path) -> None:
+    scan = write_scannet(tmp_path / "scene0000_00")
+    np.savetxt(scan / "pose/1.txt", np.full((4, 4), -np.inf))
+    (scan / "depth/2.png").unlink()
+    with pytest.raises(DataError, match=r"pose/1.txt: the pose is not finite; --skip-bad"):
+        run_import("scannet", scan, tmp_path / "out", ImportPlan(), True)
+    run_import("scannet", scan, tmp_path / "out", ImportPlan(skip_bad=True), True)
+    assert len(Store(tmp_path / "out")[0]) == 2
+
+
+def test_the_matrices_of_scannet_may_stand_beside_the_folders_of_images(tmp_path: Path) -> None:
+    scan = write_scannet(tmp_path / "scene0000_00")
+    for part in ("color", "depth"):
+        shutil.move(scan / f"intrinsic/intrinsic_{part}.txt", scan / f"intrinsics_{part}.txt")
+    shutil.rmtree(scan / "intrinsic")
+    assert read("scannet", scan).info.intrinsics == pytest.approx(ROOM.intrinsics)
+
+
+def resize_colors(scan: Path) -> None:
+    for path in scan.glob("color/*"):
+        Image.open(path).resize((64, 48)).save(path)
+
+
+@pytest.mark.parametrize(
+    ("breaks", "cause"),
+    [
+        (lambda scan: shutil.rmtree(scan / "color"), "color: no images in it"),
+        (lambda scan: (scan / "intrinsic/intrinsic_depth.txt").unlink(), "intrinsic_depth.txt: no such file"),
+        (lambda scan: np.savetxt(scan / "intrinsic/extrinsic_color.txt", np.diag([1, -1, -1, 1])),
+         "extrinsic_color.txt: the color camera is not that of the poses"),
+        (resize_colors, "48×64 pixels, the matrix of the colour camera is of about 96×128"),
+    ],
+)  # fmt: skip
+def test_a_broken_scan_is_one_line(tmp_path: Path, breaks: Callable[[Path], object], cause: str) -> None:
+    scan = write_scannet(tmp_path / "scene0000_00")
+    breaks(scan)
+    with pytest.raises(DataError, match=cause) as caught:
+        read("scannet", scan)
+    assert "\n" not in str(caught.value)
+
+
+# --- nerfstudio
+
+
+def test_frames_of_nerfstudio_with_lenses_of_their_own_get_one(tmp_path: Path) -> None:
+    capture = write_nerfstudio(tmp_path / "room")
+
+    def zoom(values: dict[str, Any]) -> None:
+        first = min(values["frames"], key=lambda frame: frame["file_path"])
+        first.update(fl_x=values["fl_x"] * 1.01, fl_y=values["fl_y"] * 1.01)
+
+    rewrite(capture / "transforms.json", zoom)
+    trajectory = read("nerfstudio", capture)
+    assert trajectory.info.intrinsics[0, 0] == pytest.approx(1.01 * ROOM.intrinsics[0, 0])
+    wide = np.abs(next(iter(ROOM.frames(walk(24)[1:2]))).rgb.astype(int) - list(trajectory.frames)[1].rgb).mean()
+    assert 0 < wide < 4
+
+
+def set_values(**changes: Any) -> Callable[[dict[str, Any]], None]:
+    return lambda values: values.update(changes)
+
+
+def set_first(**changes: Any) -> Callable[[dict[str, Any]], None]:
+    return lambda values: values["frames"][-1].update(changes)
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        (set_values(frames=[]), "transforms.json: it lists no frames"),
+        (set_values(frames=[{}]), "transforms.json: frame 0 has no file_path"),
+        (set_values(camera_model="OPENCV_FISHEYE"), "a OPENCV_FISHEYE camera; undistort the images"),
+        (set_values(k4=0.1), "its intrinsics are none of OpenCV's pinhole camera"),
+        (set_values(fl_x="wide"), "its intrinsics are not numbers"),
+        (lambda values: values.pop("cx"), "no cx; it must have fl_x, fl_y, cx, cy, w and h"),
+        (lambda values: [frame.pop("depth_file_path") for frame in values["frames"]], "no frame has depth_file_path"),
+        (set_values(w=96), "48×64 pixels, its camera is of 96×96, which is another aspect"),
+    ],
+)
+def test_a_broken_transforms_file_is_one_line(tmp_path: Path, change: Callable[..., object], cause: str) -> None:
+    capture = write_nerfstudio(tmp_path / "room")
+    rewrite(capture / "transforms.json", change)
+    with pytest.raises(DataError, match=cause) as caught:
+        read("nerfstudio", capture)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        (set_first(transform_matrix=[[1, 0], [0, 1]]), "frame_0.png: its transform_matrix is not 4×4"),
+        (set_first(transform_matrix="none"), "frame_0.png: its transform_matrix is not one of numbers"),
+        (set_first(transform_matrix=np.diag([2.0, 1, 1, 1]).tolist()), "frame_0.png: the pose is "),
+        (set_first(depth_file_path=None), "frame_0.png: no depth_file_path"),
+        (set_first(file_path="images/frame_0000.jpg"), "frame_0000.jpg: no such file"),
+    ],
+)
+def test_a_broken_frame_of_nerfstudio_is_named(tmp_path: Path, change: Callable[..., object], cause: str) -> None:
+    capture = write_nerfstudio(tmp_path / "room")
+    rewrite(capture / "transforms.json", change)
+    frames = list(read("nerfstudio", capture).frames)
+    assert isinstance(frames[0], DataError)
+    assert cause in str(frames[0])
+    assert not any(isinstance(frame, DataError) for frame in frames[1:])
