@@ -1,4 +1,4 @@
-"""nerfstudio: ``transforms.json`` with a depth image for each colour image, as Polycam, Record3D or COLMAP give it.
+"""nerfstudio: ``transforms.json`` with a depth image for each colour image, as of a phone with LiDAR.
 
 Poses are ``world_from_camera`` with OpenGL axes (x right, y up, z backward), z up in the world. Intrinsics stand once
 or for each frame and count pixels from the corner, as ours. Depth is planar, 16 bits, in millimetres, and may have
