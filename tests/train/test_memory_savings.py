@@ -10,6 +10,7 @@ import torch
 from diffusers.training_utils import EMAModel
 from torch.autograd.graph import saved_tensors_hooks
 
+from persist_backbones.extensions import savings
 from persist_cli.api.backbone import Backbone
 from persist_cli.api.stages import MemorySavings
 from persist_cli.errors import PersistError
@@ -66,6 +67,23 @@ def test_checkpointing_holds_little_of_the_forward_pass_memory_adapters_included
             backbone(random_clips(tokens=random_tokens(2, 5)), stage_)
         held[checkpointing] = sum(sizes)
     assert held[True] < held[False] / 3
+
+
+def test_frozen_blocks_before_the_first_of_an_adapter_are_not_computed_again(monkeypatch):
+    """No gradient comes through them, and torch's compiler refuses to compute again what has none."""
+    backbone = with_adapter(micro(), every=1).train()
+    backbone.trained_parameters("2")
+    blocks = [*backbone.transformer.base.transformer_blocks, *backbone.adapter.blocks.values()]
+    numbers, recomputed = {block.forward: number for number, block in enumerate(blocks)}, []
+
+    def noted(run, *inputs, use_reentrant, **named):
+        recomputed.append(numbers[run])
+        return run(*inputs, **named)
+
+    monkeypatch.setattr(savings, "checkpoint", noted)
+    backbone.apply_memory_savings("2", MemorySavings(gradient_checkpointing=True))
+    backbone(random_clips(tokens=random_tokens(2, 5)), "2")["loss"].backward()
+    assert recomputed == [2, 1, 3]  # all but the transformer's first
 
 
 @pytest.mark.usefixtures("fresh_accelerator")
@@ -139,9 +157,12 @@ def test_a_run_resumes_with_other_memory_savings(persist, usual, tmp_path):
 @pytest.mark.slow
 @pytest.mark.skipif(not shutil.which("g++"), reason="no compiler")
 @pytest.mark.parametrize("usual", ["stage2-voxel"], indirect=True)
-def test_compiled_blocks_train_nearly_alike_and_keep_the_names_of_their_weights(persist, usual, tmp_path):
+@pytest.mark.parametrize("checkpointing", ["false", "true"])
+def test_compiled_blocks_train_nearly_alike_and_keep_the_names_of_their_weights(
+    persist, usual, tmp_path, checkpointing
+):
     run, cheap = usual
-    ended = persist(*cheap("training.compile=true"))
+    ended = persist(*cheap("training.compile=true", f"training.gradient_checkpointing={checkpointing}"))
     assert ended.code == 0, ended.err
     assert losses(tmp_path / "cheap") == pytest.approx(losses(run), rel=1e-3)
     assert run_result(run)[0].keys() == run_result(tmp_path / "cheap")[0].keys()

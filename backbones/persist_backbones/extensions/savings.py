@@ -62,11 +62,16 @@ def apply_memory_savings(backbone: CogVideoX, stage: Stage, savings: MemorySavin
 
 
 def recompute_in_backward(block: nn.Module) -> None:
-    """Let a block keep only its inputs for the backward pass, in which everything inside is computed again."""
-    forward = block.forward
+    """Let a block keep only its inputs for the backward pass, in which everything inside is computed again.
+
+    Where no gradient comes through a frozen block, as before the first block of an adapter, there is nothing to
+    compute again. It then runs as it is, because torch's compiler refuses to.
+    """
+    forward, trained = block.forward, any(parameter.requires_grad for parameter in block.parameters())
 
     def recomputed(*inputs: Any, **named: Any) -> Any:
-        if not torch.is_grad_enabled():
+        tensors = (value for value in (*inputs, *named.values()) if isinstance(value, Tensor))
+        if not torch.is_grad_enabled() or not (trained or any(tensor.requires_grad for tensor in tensors)):
             return forward(*inputs, **named)
         return checkpoint(forward, *inputs, use_reentrant=False, **named)
 
