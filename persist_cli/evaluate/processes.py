@@ -8,6 +8,8 @@ from typing import Final
 import torch
 from accelerate import PartialState
 
+from persist_cli.train.distributed import explain_lost_processes
+
 LONGEST_WAIT: Final = timedelta(days=7)  # of a process for the slowest one
 
 
@@ -32,5 +34,10 @@ class Processes:
         return batch % self.count == int(self.state.process_index)
 
     def wait(self) -> None:
-        """Wait until every process is here."""
-        self.state.wait_for_everyone()
+        """Wait until every process is here.
+
+        Raises:
+            PersistError: when another one ended before, as by an error that only the main one finds.
+        """
+        with explain_lost_processes(lambda: "what was measured is kept, and the same command goes on with it"):
+            self.state.wait_for_everyone()

@@ -6,7 +6,7 @@ import contextlib
 import copy
 import importlib.util
 import os
-from collections.abc import Iterable, Iterator, Mapping, MutableMapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -28,23 +28,31 @@ MOMENTS: Final = ("exp_avg", "exp_avg_sq")  # what AdamW keeps of each parameter
 
 
 @contextlib.contextmanager
-def explain_lost_processes(run: Path) -> Iterator[None]:
+def explain_lost_processes(way_on: Callable[[], str]) -> Iterator[None]:
     """Replace torch's error about another process that ended or does not answer by one line.
 
+    Args:
+        way_on: says what was kept, and how to go on with it.
+
     Raises:
-        PersistError: with the checkpoint that the run can go on from.
+        PersistError: that line.
     """
     try:
         yield
     except RuntimeError as error:
         if not isinstance(error, distributed.DistError) and "gloo" not in str(error):
             raise
-        state, checkpoints = PartialState(), step_folders(run)
-        way_on = f"{checkpoints[-1]} is whole, go on with --resume" if checkpoints else f"{run} holds no checkpoint yet"
+        state = PartialState()
         raise PersistError(
             f"process {state.process_index} of {state.num_processes} lost another one, which ended or does not answer; "
-            f"the launcher names the first that failed; {way_on}"
+            f"the launcher names the first that failed; {way_on()}"
         ) from error
+
+
+def last_checkpoint(run: Path) -> str:
+    """In words, the checkpoint that a run can go on from."""
+    checkpoints = step_folders(run)
+    return f"{checkpoints[-1]} is whole, go on with --resume" if checkpoints else f"{run} holds no checkpoint yet"
 
 
 def fsdp_plugin(precision: str) -> FullyShardedDataParallelPlugin | None:

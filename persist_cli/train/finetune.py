@@ -11,6 +11,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from datetime import timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -65,6 +66,7 @@ from persist_cli.recipe import (
 from persist_cli.train.distributed import (
     explain_lost_processes,
     fsdp_plugin,
+    last_checkpoint,
     use_fsdp_on_cpus,
     use_zero_on_cpus,
     zero_plugin,
@@ -123,7 +125,8 @@ def run_finetune(plan: FinetunePlan) -> None:
     if not recipe.data.path:
         raise RecipeError(f"{plan.recipe}: no data set; give --data DIR")
     check_run(run, recipe, plan.resume)
-    with StopSignal() as stop, limited_threads(recipe.training.threads), explain_lost_processes(run):
+    lost = explain_lost_processes(partial(last_checkpoint, run))
+    with StopSignal() as stop, limited_threads(recipe.training.threads), lost:
         ended_by = finetune(recipe, run, stop, plan)
     if ended_by is not None:
         sys.exit(128 + ended_by)  # as a shell says that a signal ended a command: it must not go on with the next

@@ -109,6 +109,16 @@ def test_two_processes_give_the_same_figures_as_one(uninterrupted, voxel, held_o
     assert tables(tmp_path / "eval") == tables(uninterrupted)
 
 
+def test_an_error_of_the_main_process_is_one_line_of_each(voxel, walks, tmp_path):
+    """The main one alone looks for the clips; the other one then waits in vain."""
+    command = ["eval", voxel, "--data", walks, *QUICK, "--out", tmp_path / "eval"]
+    assert run_in_pair(run_command, [*map(str, command)], output=tmp_path) == [1, 1]
+    lines = [(tmp_path / name).read_text().strip().splitlines() for name in ("0.log", "1.log")]
+    assert [len(text) for text in lines] == [1, 1], lines
+    assert "the model was trained on its scene" in lines[0][0]
+    assert "error: process 1 of 2 lost another one" in lines[1][0]
+
+
 def test_figures_do_not_depend_on_the_batch_size(persist, uninterrupted, voxel, held_out, tmp_path):
     command = ["eval", voxel, "--data", held_out, *QUICK, "--batch", 2, "--controls", "copy", "--out", tmp_path]
     assert persist(*command).code == 0
