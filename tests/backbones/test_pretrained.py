@@ -1,10 +1,12 @@
 """Pretrained weights from a directory, or from the hub, which is used only for files that are not in its cache."""
 
 import shutil
+import weakref
 
 import pytest
 import torch
 
+from persist_backbones.cogvideox import parts
 from persist_backbones.cogvideox.parts import folder_here, pretrained_folder, published_preset
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import read_json, read_tensors, write_json, write_tensors
@@ -52,6 +54,27 @@ def test_an_incomplete_download_is_refused(snapshot, part):
     next(path for path in (snapshot / part).iterdir() if path.suffix == ".safetensors" or part == "scheduler").unlink()
     with pytest.raises(CheckpointError, match="not whole in the hub's cache, and the hub: HF_HUB_OFFLINE is set; give"):
         pretrained_folder(NAME)
+
+
+def test_weights_in_half_precision_go_one_by_one_as_they_are_converted(snapshot, monkeypatch):
+    """Of eight processes each reads the whole model: 11 GB of CogVideoX-5B more than the 22 GB that it keeps."""
+    path = snapshot / "transformer" / parts.WEIGHTS
+    write_tensors(path, {name: tensor.bfloat16() for name, tensor in read_tensors(path)[0].items()})
+    read, left, load = [], [], torch.nn.Module.load_state_dict
+
+    def read_and_noted(path):
+        tensors, metadata = read_tensors(path)
+        read.extend(map(weakref.ref, tensors.values()))
+        return tensors, metadata
+
+    def counted(module, *arguments, **options):
+        left.append(sum(tensor() is not None for tensor in read))
+        return load(module, *arguments, **options)
+
+    monkeypatch.setattr(parts, "read_tensors", read_and_noted)
+    monkeypatch.setattr(torch.nn.Module, "load_state_dict", counted)
+    assert parts.load_part(snapshot, "transformer").dtype == torch.float32
+    assert len(read) > 1 >= left[0]
 
 
 def test_weights_that_lack_a_shard_are_refused(snapshot):

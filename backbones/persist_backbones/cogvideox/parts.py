@@ -348,7 +348,9 @@ def _load_weights(part: nn.Module, folder: Path) -> None:
                 f"{folder}: cannot be loaded ({name!r} has the shape {tuple(tensor.shape)}, config.json wants "
                 f"{tuple(wanted[name].shape)})"
             )
-    part.load_state_dict({name: tensor.to(wanted[name].dtype) for name, tensor in tensors.items()}, assign=True)
+    # taken out one by one: every process reads all of a model, and must not hold it in two precisions
+    cast = {name: tensors.pop(name).to(wanted[name].dtype) for name in [*tensors]}
+    part.load_state_dict(cast, assign=True)
 
 
 def _read_config(folder: Path, name: str) -> dict[str, Any]:
