@@ -17,7 +17,7 @@ from typing import Any, Final
 
 import torch
 from accelerate import Accelerator
-from accelerate.utils import InitProcessGroupKwargs, set_seed
+from accelerate.utils import GradientAccumulationPlugin, InitProcessGroupKwargs, set_seed
 
 from persist_cli.api.backbone import Backbone
 from persist_cli.api.checkpoint import (
@@ -318,6 +318,7 @@ def make_accelerator(recipe: Recipe, run: Path) -> Accelerator:
         cpu=not torch.cuda.is_available(),
         fsdp_plugin=fsdp,
         deepspeed_plugin=zero,
+        gradient_accumulation_plugin=GradientAccumulationPlugin(num_steps=1),  # else the environment's divides the loss
         kwargs_handlers=[InitProcessGroupKwargs(timeout=LONGEST_WAIT)],
     )
     if accelerator.is_main_process and settings.precision == "bf16" and not torch.cuda.is_available():

@@ -92,6 +92,14 @@ def test_micro_batches_train_like_the_whole_batch(persist, walks, codec, tmp_pat
     assert torch.cat(differences).abs().mean() < 1e-2 * 4e-4  # a hundredth of a step
 
 
+def test_micro_batches_are_those_of_the_recipe_whatever_the_environment_of_accelerate_says(
+    walks, codec, stage1, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("ACCELERATE_GRADIENT_ACCUMULATION_STEPS", "4")
+    run_persist(*stage("stage1", walks, tmp_path / "run", f"base={codec}"))
+    assert equal_runs(stage1, tmp_path / "run")
+
+
 def test_gradients_are_clipped_by_the_norm_of_all_of_them(persist, walks, codec, tmp_path):
     changes = [f"base={codec}", "training.steps=1", "training.clip=0.001"]
     assert persist(*stage("stage1", walks, tmp_path / "run", *changes)).code == 0
