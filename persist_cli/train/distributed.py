@@ -127,7 +127,7 @@ class Sharding:
             module.to(accelerator.device)
         plugin = accelerator.state.fsdp_plugin
         plugin.ignored_modules = never_sharded
-        if "FSDP_AUTO_WRAP_POLICY" not in os.environ:
+        if not _launcher_names_blocks():
             _shard_blocks(plugin, backbone)
 
     def parameters(self) -> dict[str, nn.Parameter]:
@@ -281,6 +281,16 @@ def _replace_ddp_on_cpus(kind: DistributedType) -> AcceleratorState | None:
         return None
     state.distributed_type = PartialState._shared_state["distributed_type"] = kind
     return state
+
+
+def _launcher_names_blocks() -> bool:
+    """Whether the launcher says what is sharded apart.
+
+    ``accelerate config`` writes a policy by classes that names none, and means those of the model itself. Accelerate
+    knows these of transformers' models alone; of others it would gather all weights at once.
+    """
+    policy = os.environ.get("FSDP_AUTO_WRAP_POLICY", "").upper()
+    return bool(os.environ.get("FSDP_TRANSFORMER_CLS_TO_WRAP") if policy == "TRANSFORMER_BASED_WRAP" else policy)
 
 
 def _shard_blocks(plugin: FullyShardedDataParallelPlugin, backbone: Backbone) -> None:

@@ -11,6 +11,7 @@ import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -18,8 +19,11 @@ import torch
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.checkpoints.load import load_backbone
 from persist_cli.io.files import read_tensors
+from persist_cli.recipe import make_recipe, read_recipe
+from persist_cli.train.distributed import Sharding, fsdp_plugin
 from persist_cli.train.state import read_shards
 from tests.support.damage import without_sums
+from tests.support.micro_model import micro, with_adapter
 from tests.support.micro_runs import (
     MICRO_SETTINGS,
     equal_runs,
@@ -183,6 +187,27 @@ def test_sharded_gradients_are_clipped_by_the_norm_of_all_of_them(runs):
 def test_a_sharded_run_saves_a_whole_model(runs):
     backbone = load_backbone(find_checkpoint(runs / "fsdp-1"))
     assert not any(parameter.is_meta for parameter in backbone.parameters())
+
+
+@pytest.mark.parametrize(
+    ("policy", "classes", "sharded"),
+    [
+        (None, None, ["CogVideoXBlock", "MemoryBlock"]),
+        ("TRANSFORMER_BASED_WRAP", None, ["CogVideoXBlock", "MemoryBlock"]),  # as of `accelerate config`
+        ("TRANSFORMER_BASED_WRAP", "CogVideoXBlock", ["CogVideoXBlock"]),
+        ("NO_WRAP", None, None),
+    ],
+)
+def test_blocks_are_sharded_one_by_one_unless_the_launcher_names_others(monkeypatch, policy, classes, sharded):
+    chosen = {"FSDP_AUTO_WRAP_POLICY": policy, "FSDP_TRANSFORMER_CLS_TO_WRAP": classes}
+    loading = {"FSDP_CPU_RAM_EFFICIENT_LOADING": "true"}  # as of the launcher; the plugin changes it
+    for name, value in (FSDP | loading | {name: value for name, value in chosen.items() if value}).items():
+        monkeypatch.setenv(name, value)
+    plugin, backbone = fsdp_plugin("no"), with_adapter(micro())
+    backbone.trained_parameters("2")
+    process = SimpleNamespace(device=torch.device("cpu"), state=SimpleNamespace(fsdp_plugin=plugin))
+    Sharding(backbone, make_recipe(read_recipe("tiny-stage2-voxel"), "the recipe"), process)
+    assert plugin.transformer_cls_names_to_wrap == sharded
 
 
 @pytest.mark.slow
