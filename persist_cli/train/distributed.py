@@ -62,12 +62,17 @@ def fsdp_plugin(precision: str) -> FullyShardedDataParallelPlugin | None:
         precision: ``no`` or ``bf16``. With bf16 weights are sent and used in bf16, and gradients summed in float32.
 
     Raises:
-        PersistError: for FSDP 1.
+        PersistError: for FSDP 1, and for shards by size.
     """
     if os.environ.get("ACCELERATE_USE_FSDP", "false").lower() != "true":
         return None
     if os.environ.get("FSDP_VERSION", "1") != "2":
         raise PersistError("--use_fsdp: only FSDP2 is supported; add --fsdp_version 2 to accelerate launch")
+    if os.environ.get("FSDP_AUTO_WRAP_POLICY", "").upper() == "SIZE_BASED_WRAP":
+        raise PersistError(
+            "--fsdp_auto_wrap_policy SIZE_BASED_WRAP: FSDP2 does not shard the lists that blocks are in; leave it out, "
+            "and blocks are sharded one by one"
+        )
     from torch.distributed.fsdp import CPUOffloadPolicy, MixedPrecisionPolicy
 
     half = MixedPrecisionPolicy(torch.bfloat16, torch.float32, cast_forward_inputs=False)

@@ -274,6 +274,14 @@ def test_each_training_that_cannot_be_sharded_ends_in_one_line(persist, walks, c
     assert (ended.code, "add --fsdp_version 2" in ended.err) == (1, True)
 
 
+def test_shards_by_size_are_refused_in_one_line(persist, walks, codec, tmp_path, monkeypatch):
+    for name, value in (FSDP | {"FSDP_AUTO_WRAP_POLICY": "SIZE_BASED_WRAP"}).items():
+        monkeypatch.setenv(name, value)
+    ended = persist(*stage("stage1", walks, tmp_path / "run", f"base={codec}"))
+    assert (ended.code, "SIZE_BASED_WRAP: FSDP2 does not shard the lists" in ended.err) == (1, True)
+    assert len(ended.err.strip().splitlines()) == 1
+
+
 class EndlessRun:
     """A run of two processes that only a signal ends."""
 
