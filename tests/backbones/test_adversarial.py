@@ -78,6 +78,17 @@ def test_frames_after_the_given_one_are_compared_beside_what_it_shows(given, wei
     assert image.any()
 
 
+def test_a_model_without_depth_is_compared_by_colours_alone():
+    model, parameters = trained_against(depth=False)
+    clips = random_clips(2)
+    deeper = dataclasses.replace(clips, depth=clips.depth + 1)
+    losses, others = (adversarial_loss(model, batch, model.discriminator, SETTINGS) for batch in (clips, deeper))
+    assert losses["loss"] == others["loss"]
+    assert losses["discriminator"] == others["discriminator"]
+    depth = gradients(model, parameters, clips, SETTINGS)["transformer.extra_out.weight"]
+    assert not depth.any()  # nothing trains what the model predicts of depth
+
+
 def test_padding_is_not_compared():
     rotary = {"patch_size_t": 2, "patch_bias": False, "use_rotary_positional_embeddings": True}
     model = micro(transformer=MICRO["transformer"] | rotary, given="alone")

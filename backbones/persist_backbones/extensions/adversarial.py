@@ -99,7 +99,12 @@ def make_discriminator(model: CogVideoX, settings: Adversarial) -> Discriminator
     trained = model.scheduler.config.num_train_timesteps
     if settings.steps > trained:
         raise RecipeError(f"adversarial.steps={settings.steps}: this model was trained with {trained} noise levels")
-    return Discriminator(len(model.channel_weights()), (model.shape.height, model.shape.width), settings.width)
+    return Discriminator(compared_channels(model), (model.shape.height, model.shape.width), settings.width)
+
+
+def compared_channels(model: CogVideoX) -> int:
+    """Return how many channels of latents are compared: those of RGB, and of depth where the model predicts any."""
+    return len(model.channel_weights()) if model.settings.depth else model.codec.channels
 
 
 def adversarial_loss(
@@ -144,12 +149,14 @@ def to_compare(model: CogVideoX, clips: Clips, prediction: NoisedPrediction) -> 
     """Return true and predicted latents of the frames after the given one, and what that shows in their views.
 
     The given frame itself is left out: beside it every predicted one would be known by its finest detail. Channels have
-    the weight in the squared distance of two clips that the loss of denoising gives them.
+    the weight in the squared distance of two clips that the loss of denoising gives them; those of depth are left out
+    for a model without depth, whose predictions of them nothing has trained.
     """
-    shape, scale = model.shape.of(clips), model.channel_weights().sqrt()
+    shape, channels = model.shape.of(clips), compared_channels(model)
+    scale = model.channel_weights()[:channels].sqrt()
     latents = (prediction.noised.clean, prediction.clean(model.scheduler))
-    true, predicted = (shape.drop_padding(part)[:, 1:] * scale for part in latents)
-    image = prediction.noised.image.float() * scale
+    true, predicted = (shape.drop_padding(part)[:, 1:, :channels] * scale for part in latents)
+    image = prediction.noised.image[:, :, :channels].float() * scale
     alone = model.settings.given == "alone"  # nothing is said of later frames
     return true, predicted, image[:, :1].expand_as(true) if alone else shape.drop_padding(image)[:, 1:]
 
