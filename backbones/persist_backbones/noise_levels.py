@@ -52,19 +52,31 @@ def draw_levels(generators: list[torch.Generator], largest: float) -> Float[Tens
 def draw_noise(
     shape: Sequence[int], generators: list[torch.Generator], device: torch.device
 ) -> Float[Tensor, batch * shape]:
-    """Draw Gaussian noise, each sample from its own generator on the CPU; several at once while a GPU waits for it."""
+    """Draw Gaussian noise, each sample from its own generator on the CPU; several at once while a GPU waits for it.
+
+    Samples that share a generator draw from it in their order.
+    """
     noise = torch.empty(len(generators), *shape)
+    fill_with_noise(noise, generators, threads=1 if device.type == "cpu" else DRAWING_THREADS)
+    return noise if device.type == "cpu" else noise.to(device)
 
-    def draw(sample: Tensor, generator: torch.Generator) -> None:
-        torch.randn(sample.shape, generator=generator, out=sample)
 
-    if device.type == "cpu":
-        for sample, generator in zip(noise, generators, strict=True):
-            draw(sample, generator)
-        return noise
-    with ThreadPoolExecutor(DRAWING_THREADS) as threads:
-        list(threads.map(draw, noise, generators))  # so that an error in one of them is raised here
-    return noise.to(device)
+def fill_with_noise(noise: Float[Tensor, "batch ..."], generators: Sequence[torch.Generator], threads: int) -> None:
+    """Fill each sample with Gaussian noise of its generator; only samples of different ones are drawn at once."""
+    samples_of: dict[torch.Generator, list[Tensor]] = {}
+    for sample, generator in zip(noise, generators, strict=True):
+        samples_of.setdefault(generator, []).append(sample)
+
+    def draw(generator: torch.Generator, samples: list[Tensor]) -> None:
+        for sample in samples:
+            torch.randn(sample.shape, generator=generator, out=sample)
+
+    if threads == 1:
+        for generator, samples in samples_of.items():
+            draw(generator, samples)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(draw, samples_of.keys(), samples_of.values()))  # so that an error in one is raised here
 
 
 def add_level(

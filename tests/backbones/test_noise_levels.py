@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from persist_backbones.noise_levels import add_level, draw_levels
+from persist_backbones.noise_levels import add_level, draw_levels, fill_with_noise
 from persist_cli.api.backbone import Sampling
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import PersistError
@@ -26,6 +26,17 @@ def test_each_sample_gets_noise_as_strong_as_its_level() -> None:
     noisy = add_level(values, levels, generators(), unit=torch.tensor([1.0, 3.0]))
     assert torch.equal(noisy[0], values[0])
     assert noisy[1].std().item() == pytest.approx(1.5, rel=0.1)
+
+
+def test_samples_that_share_a_generator_draw_in_their_order_however_many_threads_draw() -> None:
+    def drawn(threads: int) -> torch.Tensor:
+        noise, (shared, own) = torch.empty(9, 50_000), generators()
+        fill_with_noise(noise, [shared] * 4 + [own] + [shared] * 4, threads)
+        return noise
+
+    alone = torch.randn(50_000, generator=generators()[1])
+    assert torch.equal(drawn(1)[4], alone)
+    assert all(torch.equal(drawn(8), drawn(1)) for _ in range(20))
 
 
 def test_the_noise_of_a_memory_and_what_is_drawn_next_do_not_depend_on_longer_ones_in_its_batch() -> None:
