@@ -176,6 +176,27 @@ def test_a_teacher_of_other_latents_is_refused(changes, what):
         student.distill(Distill(), teacher, copy.deepcopy(student))
 
 
+@pytest.mark.parametrize(
+    ("own", "others", "what"),
+    [
+        ({"given": "rendered"}, {}, "views of the given frame"),
+        ({}, {"given": "rendered"}, "views of the given frame"),
+        ({"image_noise": 0.3}, {}, "noise of the given frame"),
+        ({}, {"depth": False}, "depth"),
+    ],
+)
+def test_a_teacher_that_does_not_know_what_it_is_given_is_refused(own, others, what):
+    student, teacher = micro(**FRAMEWISE, **own), micro(**FRAMEWISE, **others)
+    with pytest.raises(CheckpointError, match=f"^distill.teacher: its {what} differ"):
+        student.distill(Distill(), teacher, copy.deepcopy(student))
+
+
+def test_a_teacher_may_know_more_noise_and_depth_than_the_student():
+    student, teacher = micro(**FRAMEWISE, depth=False), micro(**FRAMEWISE, image_noise=0.3)
+    student.distill(Distill(), teacher, copy.deepcopy(student))
+    assert student(random_clips(2), "1")["loss"] >= 0
+
+
 def test_a_teacher_with_another_adapter_is_refused():
     student, teacher = trained("canvas", **FRAMEWISE), trained("cross", **FRAMEWISE)
     teacher.codec.load_state_dict(student.codec.state_dict())

@@ -149,11 +149,18 @@ def predict_clean(
 
 
 def check_teacher(student: CogVideoX, teacher: CogVideoX) -> None:
-    """Raise ``CheckpointError`` unless a teacher's latents, noise levels and memory mean the same to a student."""
+    """Raise ``CheckpointError`` unless a teacher's latents, noise levels and memory mean the same to a student.
+
+    Both get the student's image condition, so the teacher must know such conditions, and noise on them.
+    """
     adapters = [None if model.adapter is None else model.adapter.settings for model in (student, teacher)]
+    own, others = student.settings, teacher.settings
     differences = {
         "codec": student.encoding() != teacher.encoding(),
-        "number of frames": student.settings.frames != teacher.settings.frames,
+        "number of frames": own.frames != others.frames,
+        "views of the given frame": own.given != others.given,
+        "noise of the given frame": own.image_noise > others.image_noise,
+        "depth": own.depth and not others.depth,
         "noise levels": not torch.equal(student.scheduler.alphas_cumprod, teacher.scheduler.alphas_cumprod),
         "memory adapter": adapters[0] != adapters[1],
     }
