@@ -37,7 +37,8 @@ class NomadSettings:
 
     Args:
         checkpoint: run or folder of a trained policy; ``None`` for the one that comes with the package.
-        steps: denoising steps, at most the network's noise levels; ``None`` for all.
+        steps: denoising steps, at least 2 and at most the network's noise levels; ``None`` for all. The scheduler would
+            take a single one at the least noise, and return what it began with: nothing but noise.
         masked: whether the goal's image is not looked at, so that it explores.
         stop: predicted spacings of frames to the goal up to which it stops; 0 never stops.
         arrive: predicted metres to the goal's place up to which it goes straight there and turns to the goal's heading;
@@ -49,7 +50,7 @@ class NomadSettings:
     """
 
     checkpoint: str | None = None
-    steps: Annotated[int, Field(ge=1)] | None = None
+    steps: Annotated[int, Field(ge=2)] | None = None
     masked: bool = False
     stop: Annotated[float, Field(ge=0, allow_inf_nan=False)] = STOP
     arrive: Annotated[float, Field(ge=0, allow_inf_nan=False)] = ARRIVE

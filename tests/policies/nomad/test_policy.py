@@ -128,6 +128,11 @@ def test_fewer_denoising_steps_are_possible_and_more_are_refused(policy_run, sit
         open_policy(str(policy_run), {"steps": 11})
 
 
+def test_a_single_denoising_step_which_would_leave_all_noise_is_refused(policy_run):
+    with pytest.raises(RecipeError, match="steps"):
+        open_policy(str(policy_run), {"steps": 1})
+
+
 def test_a_policy_opens_by_name_run_checkpoint_or_model_folder(policy_run):
     assert open_policy("random").name == "random"
     places = (policy_run, policy_run / "step-00000004", policy_run / "step-00000004/model")
