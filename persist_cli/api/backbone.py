@@ -35,7 +35,8 @@ class Sampling:
         steps: number of denoising steps, at least 1.
         sampler: name of one of the backbone's samplers.
         memory_guidance: weight of classifier-free guidance over memory, at least 0; 1 means none.
-        context_noise: noise level that given frame and memory are declared to have, at least 0; nothing is added.
+        context_noise: noise level that given frame and memory are declared to have, at least 0; each at most that of
+            its training. Nothing is added.
     """
 
     steps: int = 50

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from persist_backbones.noise_levels import add_level, draw_levels, fill_with_noise
-from persist_cli.api.backbone import Sampling
+from persist_cli.api.backbone import Clips, Sampling
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import PersistError
 from tests.support.micro_model import equal, micro, predicted_of, random_clips, random_tokens, shaken, with_adapter
@@ -79,6 +79,20 @@ def test_a_trained_model_hears_the_declared_level_and_keeps_it_when_saved(tmp_pa
     loaded = micro(image_noise=0.5)
     loaded.load_base(tmp_path)
     assert torch.equal(loaded.generate(clips, Sampling(2, context_noise=0.3))[0], noisy)
+
+
+@pytest.mark.parametrize(("image", "memory"), [(0.1, 0.5), (0.5, 0.1)])
+def test_given_frame_and_memory_are_told_no_level_above_those_of_their_training(image: float, memory: float) -> None:
+    def level_told(module: torch.nn.Module, clips: Clips) -> float:
+        told: list[torch.Tensor] = []
+        hook = module.register_forward_pre_hook(lambda _, inputs: told.append(inputs[0]))
+        model.generate(clips, Sampling(1, context_noise=0.5))
+        hook.remove()
+        return told[0].item()
+
+    model, clips = with_adapter(micro(image_noise=image), noise=memory), random_clips(1, random_tokens(1, 40))
+    assert level_told(model.transformer.image_level, clips) == pytest.approx(image)
+    assert level_told(model.adapters["voxel"].level, clips) == pytest.approx(memory)
 
 
 @pytest.mark.parametrize("form", FORMS)

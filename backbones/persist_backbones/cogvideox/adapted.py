@@ -99,7 +99,8 @@ class AdaptedBackbone(Backbone):
             tokens = adapter.noisy(tokens, level.to(self.device), generators)
         memory = adapter.prepare(tokens, cameras)
         if level is not None and adapter.settings.noise:
-            memory = dataclasses.replace(memory, level=level.to(self.device))
+            known = level.clamp(max=adapter.settings.noise)  # a higher one it has never been told
+            memory = dataclasses.replace(memory, level=known.to(self.device))
         return AdapterCondition(adapter, memory if generators is None else adapter.dropped(memory, generators))
 
     @torch.no_grad()

@@ -191,7 +191,8 @@ class CogVideoX(AdaptedBackbone):
         schedule = SamplingSchedule(self.scheduler.config, sampling.sampler, sampling.steps, generators)
         unset = torch.zeros(len(first.seeds), dtype=torch.long)
         declared = torch.full((len(first.seeds),), sampling.context_noise)
-        conditions = self.conditions(first, unset, self.memory_condition(first, level=declared), declared)
+        memory = self.memory_condition(first, level=declared)
+        conditions = self.conditions(first, unset, memory, declared.clamp(max=self.settings.image_noise))
         guidance = sampling.memory_guidance
         for number, timestep in enumerate(schedule.timesteps):
             self.current_timestep = timestep
