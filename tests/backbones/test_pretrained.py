@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from persist_backbones.cogvideox import parts
+from persist_backbones.cogvideox.diffusion import SAMPLERS, make_scheduler
 from persist_backbones.cogvideox.parts import folder_here, pretrained_folder, published_preset
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import read_json, read_tensors, write_json, write_tensors
@@ -47,6 +48,17 @@ def test_a_model_in_the_cache_under_its_publishers_former_name_is_found(cache):
 def test_a_local_directory_comes_before_a_name_on_the_hub(snapshot, tmp_path):
     shutil.copytree(snapshot, tmp_path / NAME)
     assert str(pretrained_folder(NAME)) == NAME
+
+
+@pytest.mark.parametrize("spacing", [{}, {"timestep_spacing": "linspace"}])  # none is diffusers' default: leading
+def test_sampling_begins_at_pure_noise_whatever_spacing_of_steps_the_files_name(tmp_path, spacing):
+    path = write_twin("2b", tmp_path) / "scheduler" / "scheduler_config.json"
+    write_json(path, {key: value for key, value in read_json(path).items() if key != "timestep_spacing"} | spacing)
+    config = load_twin(tmp_path).scheduler.config
+    for sampler in SAMPLERS:
+        scheduler = make_scheduler(config, sampler, 4)
+        assert scheduler.timesteps.tolist() == [999, 749, 499, 249]
+    assert config.timestep_spacing == "trailing"
 
 
 @pytest.mark.parametrize("part", ["transformer", "vae", "scheduler"])

@@ -54,6 +54,9 @@ PREFIX = "transformer."  # of the names in a pipeline's LoRA file
 DOWN, UP = ".lora_A.weight", ".lora_B.weight"
 LEVEL = "image_level."  # begins the names of the embedding of noise levels, which starts at zero
 SAMPLED = 256  # values of a tensor that enter its digest
+# of denoising steps, as CogVideoX is sampled: others begin with noise at a level where training has seen less of it,
+# or step to other levels than those of the next prediction; diffusers takes another one where a file names none
+SPACING = {"timestep_spacing": "trailing"}
 MAY_BE_ZERO = {"dropout", "freq_shift", "ofs_embed_dim", "norm_eps", "shift_factor"}  # of numbers in configurations
 
 
@@ -311,6 +314,8 @@ def load_part(folder: Path, name: str) -> Any:
             f"{folder}: no {name}/ folder; a diffusers CogVideoX directory has {', '.join(SUBFOLDERS)}"
         )
     config = _read_config(folder, name)
+    if name == "scheduler":
+        config |= SPACING
     if on_meta_device():
         return make_part(name, config)
     missing = missing_files(folder / name)
