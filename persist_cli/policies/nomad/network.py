@@ -1,8 +1,8 @@
 """NoMaD's network: what was seen and the goal become one token; a diffusion of waypoints and a distance follow it.
 
 Differences from the published training, each for a reason: the error of the distance counts for each sample whose goal
-is not masked (there a mean over the whole batch is weighed by the share of these), and all random numbers of a sample
-follow from its own seed, so that a batch can be divided.
+is not masked (there a mean over the whole batch is weighed by the share of these), and what is masked, noise and its
+level follow from a sample's own seed, whatever its batch. What is dropped out does not.
 """
 
 from __future__ import annotations
