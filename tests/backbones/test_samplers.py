@@ -1,6 +1,7 @@
 """Samplers: each calls the denoiser once a step and ends at its last clean prediction."""
 
 import functools
+import itertools
 import json
 from collections.abc import Callable
 
@@ -125,6 +126,19 @@ def test_the_last_step_leaves_no_noise(config, sampler, steps):
     noise, generators = draw_noise([0, 1])
     denoised = denoise(predict, noise, config, sampler, steps, generators)
     assert torch.allclose(denoised, cleaned[-1], rtol=0, atol=TOLERANCE)
+
+
+@CONFIGS
+@pytest.mark.parametrize("steps", [30, 170, 334, 501])  # of 1000 levels, which they do not divide
+def test_ddim_steps_to_the_level_that_the_model_is_asked_at_next(config, steps):
+    latents, draws = torch.randn(1, *SHAPE, generator=torch.Generator().manual_seed(0)), sample_generators([0])
+    schedule = SamplingSchedule(config, "ddim", steps, draws)
+    clean, noise = torch.full_like(latents, 0.7), latents.clone()
+    perfect = perfect_denoiser(clean, config)
+    for timestep, following in itertools.pairwise(schedule.timesteps):
+        latents = schedule.step(perfect(latents, timestep[None]), timestep, latents)
+        alpha, sigma = signal_and_noise(config, following[None])
+        assert torch.allclose(latents, alpha * clean + sigma * noise, atol=1e-3)
 
 
 @EVERY_SAMPLER

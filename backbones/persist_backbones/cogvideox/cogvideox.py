@@ -345,7 +345,7 @@ class CogVideoX(AdaptedBackbone):
     def check_sampling(self, sampling: Sampling) -> None:
         """Raise ``PersistError`` for an unknown sampler, bad guidance, or more steps than training has noise levels."""
         super().check_sampling(sampling)
-        check_steps(sampling.sampler, sampling.steps, self.scheduler.config.num_train_timesteps)
+        check_steps(sampling.steps, self.scheduler.config.num_train_timesteps)
         adapters = [adapter.settings.noise for adapter in self.adapters.values() if isinstance(adapter, Adapter)]
         known = max(self.settings.image_noise, *adapters, 0.0)
         if sampling.context_noise > known:

@@ -157,16 +157,10 @@ def loss_parts(error: Float[Tensor, "batch frame channel height width"], depth: 
     return {"loss": error.mean(), "rgb": color, "depth": metres} if depth else {"loss": color, "rgb": color}
 
 
-def check_steps(sampler: str, steps: int, levels: int) -> None:
-    """Raise ``PersistError`` for more steps than training has noise levels, or than diffusers' schedulers can take.
-
-    CogVideoX's own ones step by ``levels // steps`` levels, and ask the model at levels ``levels / steps`` apart. Above
-    half of the levels this is one against up to two, and noise stays.
-    """
+def check_steps(steps: int, levels: int) -> None:
+    """Raise ``PersistError`` for more steps than training has noise levels."""
     if steps > levels:
         raise PersistError(f"{steps} denoising steps; it must be 1 to {levels}")
-    if sampler in ("ddim", "dpm") and levels // 2 < steps < levels:
-        raise PersistError(f"{steps} denoising steps; {sampler} takes up to {levels // 2}, or {levels}")
 
 
 class SamplingSchedule:
@@ -196,6 +190,8 @@ class SamplingSchedule:
         """
         if self.renoises:
             return self.renoised(predicted, timestep, latents)
+        if type(self.scheduler) in COGVIDEOX.values():
+            self._aim_at_next(timestep)
         if isinstance(self.scheduler, CogVideoXDPMScheduler):
             clean, before = self.previous
             stepped, *clean_now = self.scheduler.step(
@@ -203,11 +199,20 @@ class SamplingSchedule:
             )
             self.previous = (clean_now[0], timestep)
         else:
-            stepped, *clean_now = self.scheduler.step(predicted, timestep, latents, return_dict=False)
-        last = bool(timestep == self.timesteps[-1])
-        # CogVideoX's schedulers leave noise when the steps do not divide the levels of training
-        latents = clean_now[0] if last and clean_now else stepped
-        return latents
+            stepped = self.scheduler.step(predicted, timestep, latents, return_dict=False)[0]
+        result: Tensor = stepped
+        return result
+
+    def _aim_at_next(self, timestep: Tensor) -> None:
+        """Let the next step of a CogVideoX scheduler lead to the next timestep, the last one to the clean latents.
+
+        They step by the levels of training // the steps, which is less than from timestep to timestep where the steps
+        do not divide the levels: noise would stay, of which the model is not told (diffusers issue 12633).
+        """
+        later = self.timesteps[self.timesteps < timestep]
+        following = int(later[0]) if len(later) else -1
+        self.scheduler.num_inference_steps = 1
+        self.scheduler.register_to_config(num_train_timesteps=int(timestep) - following)
 
     def renoised(self, predicted: Tensor, timestep: Tensor, latents: Tensor) -> Tensor:
         """Return the clean prediction with fresh noise of the next level (Song et al., 2303.01469, algorithm 1)."""
