@@ -122,9 +122,10 @@ def push_pull(
         weight: how many values that sum is of, 0 in holes.
     """
     mean = total / weight.clamp_min(1e-6)
-    size = total.shape[-2:]
-    if size == (1, 1):
+    height, width = total.shape[-2:]
+    if height == width == 1:
         return mean
     pooled = (F.avg_pool2d(part, 2, ceil_mode=True) for part in (total, weight))
-    coarse = F.interpolate(push_pull(*pooled), size=size, mode="bilinear")
+    # twice as large, and then cut: squeezed into an odd size, everything would move towards the first row and column
+    coarse = F.interpolate(push_pull(*pooled), scale_factor=2, mode="bilinear")[..., :height, :width]
     return torch.where(weight > 0, mean, coarse)

@@ -110,6 +110,16 @@ def test_filling_keeps_what_is_known_and_fills_with_the_mean_of_the_nearest_scal
     assert 1.0 < filled[1, 2] < 3.0
 
 
+@pytest.mark.parametrize("size", [(64, 64), (60, 90), (90, 60), (33, 45)])
+def test_a_hole_is_filled_from_both_sides_in_images_of_any_size(size):
+    ramp = (torch.arange(size[1]) + 0.5).expand(1, 1, *size)
+    first = 2 * size[1] // 3
+    weight = torch.ones(1, 1, *size)
+    weight[..., first : first + 8] = 0.0
+    error = (push_pull(ramp * weight, weight) - ramp)[..., first : first + 8]
+    assert error.mean().abs() < 2.1  # of the 8 pixels that the hole is wide
+
+
 def test_the_mask_tells_what_was_observed_from_what_was_imagined():
     tokens, clips = wall(), random_clips()
     tokens.origins[1] = Origin.IMAGINED
