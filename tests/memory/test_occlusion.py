@@ -1,6 +1,7 @@
 import pytest
 import torch
 
+from persist_cli.api.cameras import Cameras
 from persist_cli.api.geometry import unproject
 from persist_cli.api.observations import Origin
 from persist_memory.grid import occlusion
@@ -46,6 +47,15 @@ def test_a_cell_is_drawn_as_large_as_it_is_seen_and_one_behind_the_camera_is_not
         assert seen <= drawn < 2 * seen
     behind = 2 * cameras.centers[0] - ahead
     assert not covered(behind[None], 0.2, cameras).any()
+
+
+@pytest.mark.parametrize("focal", [(32.0, 32.0), (64.0, 32.0), (32.0, 64.0), (16.0, 64.0)])
+def test_cells_side_by_side_leave_no_hole_in_images_with_oblong_pixels(focal):
+    matrix = torch.tensor([[focal[0], 0.0, 32.0], [0.0, focal[1], 32.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    camera = Cameras(torch.eye(4, dtype=torch.float64)[None], matrix[None], 64, 64)
+    steps = torch.arange(-60, 61, dtype=torch.float64) * 0.1
+    wall = torch.cartesian_prod(steps, steps, torch.tensor([2.0], dtype=torch.float64))
+    assert covered(wall, 0.1, camera).all()
 
 
 @pytest.mark.parametrize("at_once", [1, 300])

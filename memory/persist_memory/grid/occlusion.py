@@ -129,7 +129,8 @@ def covered(centers: Float[Tensor, "cell 3"], edge: float, cameras: Cameras) -> 
     frames = len(cameras)
     pixels, depth = project(centers.expand(frames, -1, -1), cameras)
     ahead = depth > edge / 2
-    sizes = cameras.intrinsics[:, 0, 0].double()[:, None] * edge / depth.clamp(min=edge / 2)  # pixels
+    focal = torch.maximum(cameras.intrinsics[:, 0, 0], cameras.intrinsics[:, 1, 1]).double()
+    sizes = focal[:, None] * edge / depth.clamp(min=edge / 2)  # pixels along the axis on which there are more of them
     levels = sizes.log2().ceil().clamp(min=0)
     size = pixels.new_tensor([cameras.width, cameras.height])
     sides = levels.exp2()[..., None]
