@@ -72,6 +72,15 @@ class Cameras:
         intrinsics[..., 1, 2] -= top
         return replace(self, intrinsics=intrinsics, height=height, width=width)
 
+    def thinned(self, step: int) -> Cameras:
+        """Return cameras of images of which every ``step``-th row and column is kept, the first at ``step // 2``."""
+        height, width = (len(range(step // 2, side, step)) for side in (self.height, self.width))
+        intrinsics = self.intrinsics.double().clone()
+        intrinsics[..., :2, 2] -= step // 2 + 0.5  # from the centre of the first pixel that is kept
+        intrinsics[..., :2, :] /= step
+        intrinsics[..., :2, 2] += 0.5
+        return replace(self, intrinsics=intrinsics, height=height, width=width)
+
     def distinct(self) -> tuple[Cameras, Int64[Tensor, "*batch"]]:
         """Return every distinct camera once, with the frame axis alone, and for each of these its number there.
 

@@ -231,9 +231,8 @@ def _small(walk: DrawnWalk) -> DrawnWalk:
     if step == 1:
         return walk
     every = slice(step // 2, None, step)
-    pictures = walk.pictures[:, every, every]
     depth = None if walk.depth is None else walk.depth[:, every, every]
-    return replace(walk, pictures=pictures, depth=depth, cameras=walk.cameras.resized(*pictures.shape[1:3]))
+    return replace(walk, pictures=walk.pictures[:, every, every], depth=depth, cameras=walk.cameras.thinned(step))
 
 
 def read_poses(path: Path) -> Float[Tensor, "frame 4 4"]:

@@ -64,6 +64,13 @@ def test_a_resized_camera_sees_the_same_points_at_scaled_pixels():
     assert torch.allclose(small, full * torch.tensor([0.25, 0.5], dtype=torch.float64), atol=1e-6)
 
 
+@pytest.mark.parametrize("step", [1, 2, 3, 6])
+def test_a_thinned_camera_sees_what_the_kept_pixels_of_the_whole_one_see(step):
+    views, depth = cameras(2), 1 + torch.rand(2, 40, 64)
+    kept = slice(step // 2, None, step)
+    assert torch.allclose(unproject(depth[:, kept, kept], views.thinned(step)), unproject(depth, views)[:, kept, kept])
+
+
 def test_a_rigid_transform_and_its_inverse_cancel():
     points = torch.randn(1, 5, 3, dtype=torch.float64)
     pose = rigid(4)[None]

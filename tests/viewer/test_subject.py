@@ -6,6 +6,7 @@ import shutil
 import pytest
 import torch
 
+from persist_cli.api.geometry import unproject
 from persist_cli.api.observations import Origin
 from persist_cli.data.store import Store
 from persist_cli.errors import PersistError
@@ -18,6 +19,17 @@ def test_a_trajectory_has_its_cameras_pictures_and_points(walks):
     assert walk.numbers == (0, 1, 2, 3, 4)
     assert torch.equal(walk.pictures, Store(walks)[0].rgb(range(5)))
     assert len(subject.layers[POINTS]) == int((walk.depth > 0).sum())
+
+
+@pytest.mark.parametrize("most", [20, 12, 8])
+def test_points_of_large_images_lie_where_those_of_their_own_pixels_do(walks, monkeypatch, most):
+    monkeypatch.setattr("persist_cli.viewer.subject.MOST_PIXELS", most)
+    (walk,) = open_subject(f"{walks}#0:0-2").walks
+    seen = Store(walks)[0].read(range(2)).observations
+    step = -(-min(seen.depth.shape[1:]) // most)
+    whole = unproject(seen.depth, seen.cameras)[:, step // 2 :: step, step // 2 :: step]
+    assert walk.depth.shape == whole.shape[:3]
+    assert torch.allclose(unproject(walk.depth, walk.cameras), whole)
 
 
 def test_a_trajectory_with_cells_has_its_scene_too(cell_houses):

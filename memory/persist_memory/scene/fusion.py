@@ -103,16 +103,8 @@ def _thinned(frames: Observations) -> Observations:
     step = max(1, round(math.sqrt(cameras.height * cameras.width) / PIXELS_ACROSS))
     if step == 1:
         return frames
-    rgb, depth = (
-        frames.rgb[:, step // 2 :: step, step // 2 :: step],
-        frames.depth[:, step // 2 :: step, step // 2 :: step],
-    )
-    matrices = cameras.intrinsics.double().clone()
-    matrices[..., :2, 2] -= step // 2 + 0.5  # from the centre of the first pixel that is read
-    matrices[..., :2, :] /= step
-    matrices[..., :2, 2] += 0.5
-    height, width = depth.shape[1:]
-    return Observations(rgb, depth, Cameras(cameras.world_from_camera, matrices, height, width), frames.origins)
+    kept = slice(step // 2, None, step)
+    return Observations(frames.rgb[:, kept, kept], frames.depth[:, kept, kept], cameras.thinned(step), frames.origins)
 
 
 def _tangents(
