@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from typing import Final
 
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from persist_cli.api.ground import Cover, GroundMap
+
+ROUNDING: Final = 1e-6  # metres that something must come under the disc, so that ties do not depend on the last bit
 
 
 def way_is_free(
@@ -57,5 +60,5 @@ def _meets_occupied(
     apart = (offset - share.clamp(0, 1)[..., None] * along).norm(dim=-1)
     distance = offset.norm(dim=-1)
     nearest = torch.where(distance < radius, distance / 2, radius)  # what is touched already may not come much nearer
-    meets: Bool[Tensor, " way"] = (occupied & (share > 0) & (apart < nearest)).any(1)
+    meets: Bool[Tensor, " way"] = (occupied & (share > 0) & (apart < nearest - ROUNDING)).any(1)
     return meets

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from persist_cli.api.ground import Cover, GroundMap, ground_axes
+from persist_cli.navigation.routes import walkable
 from persist_cli.navigation.ways import way_is_free
 
 FREE, OCCUPIED, UNKNOWN = Cover.FREE, Cover.OCCUPIED, Cover.UNKNOWN
@@ -34,6 +35,17 @@ def test_an_agent_at_the_wall_may_walk_along_it_and_away_from_it_but_not_into_it
     at = (0.83, 0.0)  # 0.195 m from the middles of the wall's squares
     assert verdicts([(at, (0.58, 0.0)), (at, (0.83, 0.25)), (at, (1.08, 0.0))])[0::2] == [FREE, OCCUPIED]
     assert verdicts([((0.82, 0.0), (0.82, 0.25))]) == [FREE]
+
+
+def test_a_way_along_a_wall_at_the_very_radius_is_free_wherever_the_origin_lies():
+    states = torch.full((40, 60), int(FREE), dtype=torch.uint8)
+    states[14] = int(OCCUPIED)
+    start = torch.tensor([20.5, 10.5], dtype=torch.float64) * 0.05  # its square is four from the wall
+    for x in torch.linspace(-7.3, 7.3, 50, dtype=torch.float64).tolist():
+        ground = GroundMap(states, (x, 2 * x), 0.05, ground_axes((0.0, 0.0, 1.0)))
+        place = torch.tensor([x, 2 * x], dtype=torch.float64) + start
+        assert bool(walkable(ground, 0.2)[10, 20])
+        assert way_is_free(ground, place[None], place[None] + torch.tensor([0.25, 0.0]), 0.2).tolist() == [FREE]
 
 
 def test_a_wall_between_start_and_end_blocks_a_long_way():
