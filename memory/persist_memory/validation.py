@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from enum import IntEnum
 from typing import Any
 
@@ -30,6 +30,12 @@ def check_observations(observations: Observations, where: str) -> None:
     if len(sizes) > 1 or not len(cameras) == len(observations.origins) == len(observations):
         raise DataError(f"{where}: rgb, depth, cameras and origins differ in frames or size: {sorted(sizes)}")
     check_poses(cameras.world_from_camera.cpu(), where)
+
+
+def with_finite_depth(observations: Observations) -> Observations:
+    """Return frames in which depth that is not finite, as a simulator may give of the sky, is missing (0)."""
+    finite = observations.depth.isfinite()
+    return observations if bool(finite.all()) else replace(observations, depth=observations.depth.where(finite, 0.0))
 
 
 def check_tensors(tensors: Mapping[str, Tensor], expected: Mapping[str, tuple[torch.dtype, Shape]], where: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NoReturn
 
 import numpy as np
@@ -69,7 +70,8 @@ class CheckedSimulator(Simulator):
             self._is_broken(f"observe() returned {shown(frame)}, no Frame")
         with faults_of("simulator", self.name):
             check_given_frame(frame, info, "observe()")
-        return frame
+        known = np.isfinite(frame.depth) & (frame.depth > 0)  # as the store has it: others are missing
+        return frame if known.all() else replace(frame, depth=np.where(known, frame.depth, 0))
 
     def act(self, action: str) -> bool:
         """Do an action; it is broken, too, where a step leads elsewhere than ``ahead`` says."""

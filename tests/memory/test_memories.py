@@ -29,6 +29,21 @@ def test_a_frame_without_valid_depth_writes_nothing(name):
     assert memory.tensors() == {}
 
 
+@pytest.mark.parametrize("name", [*MEMORIES, "points", "scene"])
+@pytest.mark.parametrize("sky", [math.inf, -math.inf, math.nan])
+def test_depth_that_is_not_finite_is_missing(name, sky):
+    observations = room_walk(1)
+    with_sky, without = observations.depth.clone(), observations.depth.clone()
+    with_sky[:, :16], without[:, :16] = sky, 0.0
+    encoder = make_encoder("classes" if name == "scene" else "patches", {})
+    memory, other = (make_memory(name, {}, encoder, FrameOfReference("room", UP)) for _ in range(2))
+    memory.write(replace(observations, depth=with_sky))
+    other.write(replace(observations, depth=without))
+    stored, wanted = memory.tensors(), other.tensors()
+    assert stored.keys() == wanted.keys()
+    assert all(torch.equal(stored[part], wanted[part]) for part in stored if part != "content")  # a hash of the frame
+
+
 @pytest.mark.parametrize("name", MEMORIES)
 def test_writing_no_frames_writes_nothing(name):
     assert written_memory(name, room_walk(1)[0:0]).tensors() == {}

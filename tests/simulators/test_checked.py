@@ -13,6 +13,7 @@ import pytest
 from persist_cli.api.actions import walking_actions
 from persist_cli.api.observations import Frame, TrajectoryInfo
 from persist_cli.api.simulator import Simulator
+from persist_cli.data.images import decode_depth, encode_depth
 from persist_cli.data.store import Store
 from persist_cli.environments.simulated import SimulatedScenes, SimulatedSettings
 from persist_cli.episodes.find_episodes import EpisodeSearch
@@ -227,6 +228,18 @@ def test_a_simulator_as_a_model_is_checked(hall, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(Hall, "wrong", {"frame": {"rgb": None}})
     with pytest.raises(PluginError, match=r"is broken: observe\(\): rgb is None, no array of numpy"):
         future.imagine([["forward", "left"]], "best")
+
+
+def test_depth_that_is_none_is_missing_as_in_the_store(hall, monkeypatch: pytest.MonkeyPatch) -> None:
+    depth = np.full((8, 8), 2.0, np.float32)
+    depth[:3] = np.array([math.inf, math.nan, -1.0])[:, None]
+    monkeypatch.setattr(Hall, "wrong", {"frame": {"depth": depth}})
+    simulator = checked_simulator("hall", {})
+    simulator.open_scene(0)
+    simulator.place((0.0, 0.0), 0.0)
+    seen = simulator.observe().depth
+    assert seen.dtype == np.float32
+    assert np.array_equal(seen, decode_depth(encode_depth(depth)))
 
 
 def test_a_stance_that_is_none_is_refused(hall, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,6 +26,7 @@ from persist_memory.validation import (
     check_observations,
     check_origins,
     check_tensors,
+    with_finite_depth,
     with_origins,
 )
 
@@ -74,7 +75,7 @@ class PointCloud(Memory):
             DataError: when a pose is not finite and rigid; then nothing is written.
         """
         check_observations(observations, f"memory {self.name!r}")
-        for origin, frames in observations.by_origin() if len(observations) else ():
+        for origin, frames in with_finite_depth(observations).by_origin() if len(observations) else ():
             known = self._of(Origin.OBSERVED)
             if origin == Origin.IMAGINED and known:
                 positions = known["positions"].to(frames.depth.device)

@@ -43,7 +43,7 @@ from persist_memory.scene.imagination import (
 )
 from persist_memory.scene.interaction import LOAD, Load, Reached, changed_cells, reached_box, read_load
 from persist_memory.scene.settings import GridSceneSettings
-from persist_memory.validation import check_mergeable, check_observations
+from persist_memory.validation import check_mergeable, check_observations, with_finite_depth
 
 
 class GridScene(Scene):
@@ -112,7 +112,7 @@ class GridScene(Scene):
         """
         check_observations(observations, f"memory {self.name!r}")
         check_within_grid(observations.cameras, self._axes, self.settings.size, f"memory {self.name!r}")
-        for origin, frames in observations.by_origin() if len(observations) else ():
+        for origin, frames in with_finite_depth(observations).by_origin() if len(observations) else ():
             if origin == Origin.IMAGINED and not self.settings.writes_imagined:
                 continue
             votes = votes_of(frames, self._axes, self.settings.size, self.settings.farthest)
