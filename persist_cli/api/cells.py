@@ -16,10 +16,23 @@ from persist_cli.api.ground import ground_axes
 FREE, SOLID, OUTSIDE = 0, 1, 2  # the first classes of every palette
 COMMON = ("free", "solid", "outside")  # "solid" is something of which no more is known, "outside" is where no room is
 
+# Cells are centred on multiples of their size: floors and walls often have round coordinates, and a boundary of
+# cells there would split each of them in two by the noise of depth. The millionth keeps a point that lies exactly on
+# a boundary on one side of it, wherever the world's origin is.
+CENTERED = 0.5 + 1e-6
+
 
 def is_solid(classes: UInt8[Tensor, "*batch"]) -> Bool[Tensor, "*batch"]:
     """Return which classes are of something."""
     return (classes != FREE) & (classes != OUTSIDE)
+
+
+def numbers_at(places: Float[Tensor, "*batch axis"]) -> Int64[Tensor, "*batch axis"]:
+    """Return the numbers of the cells in which places lie that are given in cells from the middle of cell 0.
+
+    A place on the border of two cells lies in the higher one, wherever the origin is.
+    """
+    return (places + CENTERED).floor().long()
 
 
 class CellOrigin(IntEnum):
@@ -119,7 +132,7 @@ class CellGrid:
 
     def numbers(self, positions: Float[Tensor, "*batch 3"]) -> Int64[Tensor, "*batch 3"]:
         """Return the numbers of the cells in which positions in world metres lie."""
-        return ((positions.double() @ self.axes.T) / self.form.size).round().long()
+        return numbers_at((positions.double() @ self.axes.T) / self.form.size)
 
     def centers(self) -> Float[Tensor, "first second level 3"]:
         """Return the centres of all cells in world metres, float64."""

@@ -71,6 +71,17 @@ def test_a_pixel_that_looks_far_away_does_not_change_what_the_others_free():
     assert int(still.sum()) > 0.97 * int(freed.sum()) > 150
 
 
+@pytest.mark.parametrize("ahead", [2.0, 2.0625, 2.125])  # the second wall is met on the border of two cells
+def test_a_world_moved_by_a_cell_has_the_same_cells(ahead):
+    frame, numbers = observe([look((0.0, 1.25, 0.0), 0.0, 0.0)]), []
+    for cells in (0, 1):
+        cameras = replace(frame.cameras, world_from_camera=frame.cameras.world_from_camera.clone())
+        cameras.world_from_camera[:, :3, 3] += 0.25 * cells
+        wall = scene(replace(frame, depth=torch.full_like(frame.depth, ahead), cameras=cameras)).cells
+        numbers.append(wall.solid.nonzero() + torch.tensor(wall.corner) - wall.numbers(cameras.centers[0]))
+    assert torch.equal(*numbers)
+
+
 def test_a_grazing_look_over_the_floor_frees_none_of_its_cells():
     grid = scene(observe([look((2.2, 1.3, 0.0), 90.0, -2.0)], 64, 64)).cells
     floor = -grid.corner[2]

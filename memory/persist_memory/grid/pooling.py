@@ -18,14 +18,10 @@ from jaxtyping import Float, Int64, UInt8
 from pydantic import Field, NonNegativeFloat, PositiveInt
 from torch import Tensor
 
+from persist_cli.api.cells import CENTERED
 from persist_cli.api.observations import Observations
 from persist_memory.grid.storage import AXIS_BITS, LIMIT, keys_of_numbers
 from persist_memory.metres import Metres
-
-# Cells are centred on multiples of their size: floors and walls often have round coordinates, and a boundary of
-# cells there would split each of them in two by the noise of depth. The millionth keeps a point that lies exactly on
-# a boundary on one side of it, wherever the world's origin is.
-CENTERED = 0.5 + 1e-6
 
 NO_CELL = torch.iinfo(torch.int64).min  # the number of a pixel that falls into no cell
 

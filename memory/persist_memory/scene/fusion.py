@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int64, UInt8
 from torch import Tensor
 
 from persist_cli.api.cameras import Cameras
+from persist_cli.api.cells import numbers_at
 from persist_cli.api.geometry import camera_rays
 from persist_cli.api.observations import Observations
 from persist_cli.errors import DataError
@@ -128,8 +129,8 @@ def _frame_votes(view: _View, axes: Float[Tensor, "3 3"], size: float, farthest:
     believed = (view.depth > 0) & (view.depth <= farthest)
     inner = view.points[believed] + UNDER * size * view.normals[believed]
     places = inner @ lattice_from_camera.T + origin
-    home = origin.round().long()  # what is packed is counted from there, so that the rim of the grid is no seam
-    keys, inverse = torch.unique(pack(*(places.round().long() - home).unbind(1)), return_inverse=True)
+    home = numbers_at(origin)  # what is packed is counted from there, so that the rim of the grid is no seam
+    keys, inverse = torch.unique(pack(*(numbers_at(places) - home).unbind(1)), return_inverse=True)
     hit = unpack(keys) + home
     colors = torch.cat([view.rgb[believed].long(), torch.ones_like(inverse)[:, None]], dim=1)
     sums = torch.zeros(len(hit), 4, dtype=torch.int64, device=hit.device).index_add_(0, inverse, colors)
@@ -141,7 +142,7 @@ def _passed(
     view: _View, lattice_from_camera: Float[Tensor, "3 3"], origin: Float[Tensor, " 3"], size: float, farthest: float
 ) -> Int64[Tensor, "cell 3"]:
     """Return the cells that rays pass with enough room behind, and the one of the camera itself."""
-    home = origin.round().long()[None]
+    home = numbers_at(origin)[None]
     ends = view.points[view.depth > 0]
     if not len(ends):
         return home

@@ -13,7 +13,7 @@ from torch import Tensor
 from persist_cli.api.actions import Action
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.cell_rays import first_surfaces, sheet_cells
-from persist_cli.api.cells import SOLID, Box, CellForm, CellGrid, CellOrigin
+from persist_cli.api.cells import SOLID, Box, CellForm, CellGrid, CellOrigin, numbers_at
 from persist_cli.api.encoder import Encoder
 from persist_cli.api.geometry import camera_rays
 from persist_cli.api.ground import Body, ground_axes
@@ -327,7 +327,7 @@ class GridScene(Scene):
 
     def _number_at(self, position: Float[Tensor, " 3"]) -> list[int]:
         """The number of the cell at a place in world metres."""
-        numbers: list[int] = (self._axes @ position.cpu().double() / self.settings.size).round().long().tolist()
+        numbers: list[int] = numbers_at(self._axes @ position.cpu().double() / self.settings.size).tolist()
         return numbers
 
     def _stride(self, path: Cameras, budget: int) -> int:
