@@ -37,18 +37,41 @@ class Distances:
         """Return the metres of the shortest way from places on the ground axes, infinite without one, float64.
 
         A place without a way, such as one that is too near to a wall, takes that of the square with the shortest way
-        within 0.5 m of it, and the straight metres to that.
+        within 0.5 m of it on its own side of all that is occupied, and the straight metres to that.
         """
         flat = places.reshape(-1, 2).double()
         metres = self._from_squares(flat[:, None])[:, 0]
         lost = metres.isinf()
         if bool(lost.any()):
-            count = math.ceil(SNAP / self.ground.spacing)
-            steps = torch.arange(-count, count + 1, dtype=torch.float64) * self.ground.spacing
-            offsets = torch.cartesian_prod(steps, steps)
-            offsets = offsets[offsets.norm(dim=1) <= SNAP]
-            metres[lost] = (self._from_squares(flat[lost][:, None] + offsets) + offsets.norm(dim=1)).amin(1)
+            metres[lost] = self._from_beside(flat[lost])
         return metres.reshape(places.shape[:-1])
+
+    def _from_beside(self, places: Float[Tensor, "place 2"]) -> Float[Tensor, " place"]:
+        """The metres of the shortest way from squares beside places, with the straight way to them."""
+        count = math.ceil(SNAP / self.ground.spacing)
+        steps = torch.arange(-count, count + 1, dtype=torch.float64) * self.ground.spacing
+        offsets = torch.cartesian_prod(steps, steps)
+        offsets = offsets[offsets.norm(dim=1) <= SNAP]
+        metres = self._from_squares(places[:, None] + offsets) + offsets.norm(dim=1)
+        left = torch.arange(len(places))
+        while len(left):  # the straight way to the best square of most places is clear
+            least, number = metres[left].min(1)
+            left, number = left[least.isfinite()], number[least.isfinite()]
+            blocked = self._leads_into_something(places[left], offsets[number])
+            metres[left[blocked], number[blocked]] = math.inf
+            left = left[blocked]
+        nearest: Float[Tensor, " place"] = metres.amin(1)
+        return nearest
+
+    def _leads_into_something(
+        self, places: Float[Tensor, "place 2"], offsets: Float[Tensor, "place 2"]
+    ) -> Bool[Tensor, " place"]:
+        """Whether the straight way by an offset comes into what is occupied; out of it, it may lead."""
+        count = math.ceil(2 * SNAP / self.ground.spacing)
+        shares = torch.linspace(0, 1, count + 1, dtype=torch.float64)[:, None, None]
+        occupied = self.ground.at(places + shares * offsets) == Cover.OCCUPIED
+        entered: Bool[Tensor, " place"] = (occupied[1:] & ~occupied[:-1]).any(0)
+        return entered
 
     def _from_squares(self, places: Float[Tensor, "place near 2"]) -> Float[Tensor, "place near"]:
         """The metres of the squares that places lie in; infinite outside of the map."""
@@ -157,13 +180,14 @@ def _sources(
     if not len(squares):
         return []
     middles = (squares.flip(1) + 0.5) * ground.spacing + torch.tensor(ground.origin, dtype=torch.float64)
-    found = []
+    found: dict[int, float] = {}  # a square beside several places begins with the nearest of them
     for place in places.double():
         apart = (middles - place).norm(dim=1)
         near = (apart <= max(float(apart.min()) + ground.spacing / 2, ground.spacing)) & (apart <= SNAP)
         for row, column, metres in zip(*squares[near].T.tolist(), apart[near].tolist(), strict=True):
-            found.append((row * allowed.shape[1] + column, metres))
-    return found
+            number = row * allowed.shape[1] + column
+            found[number] = min(metres, found.get(number, math.inf))
+    return [*found.items()]
 
 
 def _dijkstra(

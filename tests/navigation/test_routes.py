@@ -51,6 +51,22 @@ def test_there_is_no_way_through_a_whole_wall_or_a_gap_that_is_too_narrow():
     assert math.isfinite(metres(distances_to(narrow, place(1.0, 0.0), 0.1), -1.0, 0.0))
 
 
+@pytest.mark.parametrize("beside", [0.24, 0.2, 0.15, 0.1])
+def test_a_place_too_near_to_a_wall_is_not_as_near_as_what_is_behind_it(beside):
+    distances = distances_to(room_with_wall(), place(0.6, -1.5), radius=0.2)
+    away = metres(distances, -0.5, -1.5)
+    assert away > 5
+    assert metres(distances, -beside, -1.5) == pytest.approx(away, abs=0.5)
+    assert metres(distances, beside, -1.5) == pytest.approx(0.6 - beside, abs=0.1)
+
+
+def test_of_several_places_each_square_is_as_far_as_from_the_nearest_alone():
+    places = torch.tensor([[x / 20 + 0.525, -0.975] for x in range(10)], dtype=torch.float64)
+    together = distances_to(room_with_wall(), places, radius=0.2).metres
+    alone = torch.stack([distances_to(room_with_wall(), one[None], radius=0.2).metres for one in places])
+    assert torch.allclose(together, alone.amin(0))
+
+
 def test_unknown_ground_is_walked_only_where_a_factor_is_given():
     ground, far = room_with_wall(), place(3.0, 0.0)  # outside of the map
     assert math.isinf(metres(distances_to(ground, far, 0.2), 1.0, 0.0))
