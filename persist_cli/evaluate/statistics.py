@@ -240,7 +240,7 @@ def set_figure(distance: Distance, draws: Draws, seeds: int, known: Counts | Non
     Args:
         distance: distance of the clips, each counted so often, from the true ones, of a model at a sampling seed.
         draws: draws of clips and models.
-        seeds: number of sampling seeds; bootstrap samples take turns over them.
+        seeds: number of sampling seeds; every bootstrap sample is a mean over all of them, as the figure is.
         known: clusters with -1 where a clip does not take part; ``None`` when all do.
     """
 
@@ -252,10 +252,13 @@ def set_figure(distance: Distance, draws: Draws, seeds: int, known: Counts | Non
     drawn = np.array(
         [
             np.average(
-                [known_distance(clips, model, turn % seeds) for model in models.nonzero()[0]],
+                [
+                    np.mean([known_distance(clips, model, seed) for seed in range(seeds)])
+                    for model in models.nonzero()[0]
+                ],
                 weights=models[models > 0],
             )
-            for turn, (clips, models) in enumerate(zip(draws.clips, draws.models, strict=True))
+            for clips, models in zip(draws.clips, draws.models, strict=True)
         ]
     )
     drawn += float(mean(by_seed)) - float(mean(drawn))

@@ -156,6 +156,17 @@ def test_the_interval_of_a_distance_between_sets_lies_around_it():
     assert figure.per_clip is None
 
 
+def test_the_interval_of_a_distance_is_of_its_mean_over_all_sampling_seeds():
+    values = np.random.default_rng(0).normal(20, 4, (1, 3, 50))
+
+    def mean_of_clips(counts, model, seed):
+        return float(counts @ values[model, seed] / counts.sum())
+
+    of_set, of_clips = set_figure(mean_of_clips, Draws.of(range(50)), 3), apart(values)
+    assert of_set.mean == pytest.approx(of_clips.mean)
+    assert of_set.high - of_set.low == pytest.approx(of_clips.high - of_clips.low)
+
+
 def test_a_sample_of_one_clip_has_no_frechet_distance_and_ends_nothing():
     features = torch.from_numpy(np.random.default_rng(0).normal(0, 1, (2, 5, 3)))
     draws = Draws.of([0, 0, 0, 0, 1], count=200)  # of two scenes one is drawn: four clips, or a single one
