@@ -201,6 +201,9 @@ def mean_figure(values: Array, draws: Draws, weights: Array | None = None) -> Fi
 def curve_figure(values: Array, weights: Array, of_curve: Callable[[Array], Array], draws: Draws) -> Figure:
     """A figure of a mean curve, such as its least value, with the interval of that figure.
 
+    The curve of a bootstrap sample is noisier than that of all clips, so that its least value is lower and its range
+    wider. The interval is therefore that of the resampled figures moved so that their mean is the figure itself.
+
     Args:
         values: ``[model, seed, clip, place]``, NaN where a clip has no value.
         weights: how much each value counts.
@@ -210,7 +213,7 @@ def curve_figure(values: Array, weights: Array, of_curve: Callable[[Array], Arra
     by_seed = np.stack([of_curve(weighted_mean(*model, axis=1)) for model in zip(values, weights, strict=True)])
     known = np.isfinite(values).any(axis=(0, 1, 3))
     clusters = np.where(known, draws.clusters, -1)
-    return make_figure(by_seed, of_curve(resampled_means(values, draws, weights)), clusters)
+    return make_figure(by_seed, moved_to(by_seed, of_curve(resampled_means(values, draws, weights))), clusters)
 
 
 def resampled_means(values: Array, draws: Draws, weights: Array | None = None) -> Array:
@@ -261,8 +264,13 @@ def set_figure(distance: Distance, draws: Draws, seeds: int, known: Counts | Non
             for clips, models in zip(draws.clips, draws.models, strict=True)
         ]
     )
-    drawn += float(mean(by_seed)) - float(mean(drawn))
-    return make_figure(by_seed, drawn, draws.clusters if known is None else known)
+    return make_figure(by_seed, moved_to(by_seed, drawn), draws.clusters if known is None else known)
+
+
+def moved_to(by_seed: Array, drawn: Array) -> Array:
+    """The figures of bootstrap samples, moved so that their mean is that of the figures ``[model, seed]``."""
+    moved: Array = drawn + (float(mean(by_seed)) - float(mean(drawn)))
+    return moved
 
 
 def make_figure(by_seed: Array, drawn: Array, clusters: Counts, per_clip: Array | None = None) -> Figure:

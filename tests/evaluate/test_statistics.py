@@ -187,6 +187,13 @@ def test_the_least_value_of_a_mean_curve_has_an_interval():
     assert figure.low < figure.mean < figure.high
 
 
+def test_the_least_value_of_a_flat_curve_lies_in_the_middle_of_its_interval():
+    values = np.random.default_rng(0).normal(0.3, 0.05, (1, 1, 16, 16))
+    figure = curve_figure(values, np.ones_like(values), lambda curves: curves.min(axis=1), Draws.of(range(16)))
+    assert figure.resampled.mean() == pytest.approx(figure.mean)
+    assert figure.low < figure.mean < figure.high
+
+
 def test_frames_are_binned_by_the_share_of_their_view_seen_before():
     values, shares = np.array([[1.0, 2.0, 3.0, np.nan]]), np.array([[0.05, 0.95, 1.0, 0.5]])
     assert seen_bins(values, shares, np.ones_like(values)) == [
