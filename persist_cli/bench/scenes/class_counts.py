@@ -7,6 +7,7 @@ the union 8 + 9 − 6 = 11. Counts are added over images before they are divided
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -62,17 +63,19 @@ def class_iou(counts: Counts | Numbers, row: int) -> Numbers:
 
 
 def mean_iou(counts: Counts | Numbers, rows: Sequence[int]) -> Numbers:
-    """Return the mean over those of some classes that neither lack in the truth nor in what is said; NaN for none."""
+    """Return the mean over those of some classes that the truth has, whatever is said; NaN for none."""
     if not rows:
         return np.full(counts.shape[:-2], np.nan)
     values = np.stack([class_iou(counts, row) for row in rows], -1)
-    known = np.isfinite(values)
+    known = counts[..., [*rows], 2] > 0
     total: Numbers = np.where(known, values, 0.0).sum(-1) / np.where(known.any(-1), known.sum(-1), np.nan)
     return total
 
 
 def iou_figure(counts: Counts, rows: Sequence[int], draws: Draws) -> Figure:
-    """Return the mean intersection over union of some classes, with its interval over houses.
+    """Return the mean intersection over union of some classes, and over seeds, with its interval over houses.
+
+    A class that no house of a bootstrap sample has is left out of it, in all rows alike.
 
     Args:
         counts: ``[seed, view, class + 1, 3]`` as of ``class_counts``.
@@ -80,12 +83,12 @@ def iou_figure(counts: Counts, rows: Sequence[int], draws: Draws) -> Figure:
         draws: of the views' houses.
     """
     by_seed = mean_iou(counts.sum(1), rows)
-    drawn = np.einsum("rv,vck->rck", draws.clips.astype(np.float64), counts.sum(0).astype(np.float64))
-    return make_figure(by_seed[None], mean_iou(drawn, rows), draws.clusters)
+    drawn = np.einsum("rv,svck->rsck", draws.clips.astype(np.float64), counts.astype(np.float64))
+    return make_figure(by_seed[None], mean_iou(drawn, rows).mean(1), draws.clusters)
 
 
 def share_figure(hits: Numbers, all_: Numbers, draws: Draws) -> Figure:
-    """Return a share, the sum of hits over the sum of all, with its interval over houses.
+    """Return a share, the sum of hits over the sum of all, of all seeds together, with its interval over houses.
 
     Args:
         hits: ``[seed, view]``.
@@ -94,6 +97,8 @@ def share_figure(hits: Numbers, all_: Numbers, draws: Draws) -> Figure:
     """
     weights = draws.clips.astype(np.float64)
     with np.errstate(invalid="ignore", divide="ignore"):
+        whole = hits.sum() / all_.sum()
         by_seed = hits.sum(1) / all_.sum(1)
         drawn = (weights @ hits.sum(0)) / (weights @ all_.sum(0))
-    return make_figure(by_seed[None], drawn, np.where(all_.sum(0) > 0, draws.clusters, -1))
+    figure = make_figure(by_seed[None], drawn, np.where(all_.sum(0) > 0, draws.clusters, -1))
+    return replace(figure, mean=float(whole), by_model=np.array([whole]))

@@ -93,6 +93,33 @@ def test_counts_are_added_over_houses_before_they_are_divided():
     assert share.mean == pytest.approx(4 / 12)
 
 
+def test_a_share_of_all_seeds_lies_in_its_interval_where_one_seed_has_a_single_door():
+    hits, doors = np.zeros((2, 6)), np.zeros((2, 6))
+    hits[0, 0], doors[0, 0], doors[1] = 1, 1, [2, 2, 2, 1, 1, 1]
+    share = share_figure(hits, doors, Draws.of(range(6)))
+    assert share.mean == share.by_model[0] == pytest.approx(1 / 10)
+    assert share.low <= share.mean <= share.high
+    assert np.isnan(share_figure(0 * hits, 0 * doors, Draws.of(range(6))).mean)
+
+
+def test_rows_are_compared_in_the_classes_that_the_drawn_houses_have_whatever_a_row_says_of_others():
+    counts = np.zeros((1, 8, 3, 3), np.int64)
+    counts[0, :, 0] = [5, 10, 10]
+    counts[0, 0, 1, 2] = 10  # a single house has the second class
+    says = counts.copy()
+    says[0, :, 1, 1] = 1  # the other row says it of a cell of each house, wrongly
+    silent, wrong = (iou_figure(one, [0, 1], Draws.of(range(8))) for one in (counts, says))
+    assert silent.mean == wrong.mean == pytest.approx((1 / 3 + 0) / 2)
+    assert np.array_equal(silent.resampled, wrong.resampled)
+
+
+def test_the_interval_of_a_mean_over_seeds_is_of_that_mean():
+    counts = np.zeros((2, 8, 2, 3), np.int64)
+    counts[0, :, 0], counts[1, :, 0] = [10, 10, 10], [0, 90, 10]  # one seed is right, the other says too much
+    figure = iou_figure(counts, [0], Draws.of(range(8)))
+    assert figure.low == figure.mean == figure.high == pytest.approx(0.5)
+
+
 @pytest.mark.parametrize("turns", range(4))
 def test_the_nearest_house_is_found_at_any_turn_and_shift(turns):
     grid = another_house()
