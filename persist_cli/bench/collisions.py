@@ -400,7 +400,7 @@ def print_collisions(result: dict[str, Any]) -> None:
 
     def cell(figure: dict[str, float]) -> str:
         low, high = figure["low"], figure["high"]
-        bounds = f" [{100 * low:.0f}, {100 * high:.0f}]" if low == low else ""
+        bounds = f" [{100 * low:.0f}, {100 * high:.0f}]" if low < high else ""
         return "–" if figure["mean"] != figure["mean"] else f"{100 * figure['mean']:.1f}{bounds}"
 
     rows = [

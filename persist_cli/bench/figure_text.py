@@ -44,15 +44,20 @@ class FigureColumn:
         if figure is None or figure["mean"] is None:
             return MISSING
         text = self.amount(figure["mean"])
-        if not interval or figure["low"] is None:
-            return text
-        return f"{text} [{self.amount(figure['low'])}, {self.amount(figure['high'])}]"
+        return f"{text} {self.interval(figure)}".rstrip() if interval else text
+
+    def interval(self, figure: Mapping[str, Any]) -> str:
+        """Return the text of a figure's interval; empty where it has none.
+
+        Where all houses have the same figure, as 100 %, every bootstrap sample has it too. Such an interval has no
+        width, but not because other houses would have no other figure: it is no interval.
+        """
+        low, high = figure["low"], figure["high"]
+        return "" if low is None or low == high else f"[{self.amount(low)}, {self.amount(high)}]"
 
     def parts(self, figure: Mapping[str, Any] | None) -> dict[str, str]:
         """Return the text of a figure and of its interval apart, the latter empty where it has none."""
-        has_interval = figure is not None and figure["low"] is not None
-        interval = f"[{self.amount(figure['low'])}, {self.amount(figure['high'])}]" if figure and has_interval else ""
-        return {"text": self.cell(figure, interval=False), "interval": interval}
+        return {"text": self.cell(figure, interval=False), "interval": self.interval(figure) if figure else ""}
 
     def gap(self, difference: Mapping[str, Any] | None) -> str:
         """Return the text of a paired difference, starred where its interval leaves zero out."""
