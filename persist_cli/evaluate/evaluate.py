@@ -26,7 +26,7 @@ from persist_cli.evaluate.report.scrutiny import scrutiny_json
 from persist_cli.evaluate.report.terminal import print_results
 from persist_cli.evaluate.report.text import table_text
 from persist_cli.evaluate.rows.model_rows import ModelRow
-from persist_cli.evaluate.statistics import LEAST_UNITS, RESAMPLES
+from persist_cli.evaluate.statistics import LEAST_UNITS, RESAMPLES, SET_RESAMPLES
 from persist_cli.evaluate.windows import SHOWN, window_bounds
 from persist_cli.io.command_line import running_command
 from persist_cli.io.files import check_folder, write_json, write_text
@@ -35,6 +35,8 @@ from persist_cli.output.console import print_json, say
 RESULTS = "metrics.json"
 
 TABLES = "tables.md"
+
+BOOTSTRAP = {"resamples": RESAMPLES, "set_resamples": SET_RESAMPLES}  # samples of means, and of distances between sets
 
 
 def run_eval(paths: Sequence[Path], plan: EvalPlan, out: Path, report: Path | None, json: bool) -> None:
@@ -111,7 +113,7 @@ def results_json(run: Evaluation, processes: int) -> dict[str, Any]:
             "batch": run.plan.batch,
         }
         | run.plan.placement.changes(),
-        "statistics": {"resampled": run.plan.resample, "resamples": RESAMPLES, "least": LEAST_UNITS},
+        "statistics": {"resampled": run.plan.resample, "least": LEAST_UNITS} | BOOTSTRAP,
         "warnings": contamination_warnings(run.checkpoints, run.cases),
         "training_scenes_allowed": run.plan.allow_training_scenes,
         "environment": environment(processes),

@@ -278,10 +278,14 @@ class SamplingRecord(SamplingSettings):
 
 
 class StatisticsRecord(ResultModel):
-    """What bootstrap samples draw; results of earlier versions, which do not say it, drew clips."""
+    """What bootstrap samples draw; results of earlier versions, which do not say it, drew clips.
+
+    ``set_resamples`` is the number of those of distances between sets, as FVD.
+    """
 
     resampled: Literal["scenes", "clips"] = "clips"
     resamples: int | None = None
+    set_resamples: int | None = None
 
 
 class EvalResults(ResultModel):

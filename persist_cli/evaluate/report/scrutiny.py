@@ -16,13 +16,15 @@ from persist_cli.evaluate.report.remarks import (
     training_seed_line,
     unknown_scenes_lines,
 )
-from persist_cli.evaluate.report.result_file import EvalResults, RowRecord, TableRecord
+from persist_cli.evaluate.report.result_file import ClipRecord, EvalResults, RowRecord, TableRecord
 from persist_cli.evaluate.report.tables import number_text
 from persist_cli.evaluate.statistics import LEAST_UNITS
 
 DIGITS = 12  # characters shown of a hash
 
 SHARP = 0.7  # of the truth's, below which a row is called blurred
+
+SETS = ("fvd", "kd-dinov2")  # metrics that are distances between sets, which cost more
 
 CELLS = {"cells": "cells in the map"}  # what has windows and is no metric
 
@@ -99,13 +101,33 @@ def _intervals(results: EvalResults) -> Answer:
     drawn = {"scenes": "whole scenes with all their clips", "clips": "single clips, as if they were independent"}[unit]
     trainings = " and trainings" if any(len(row.training_seeds) > 1 for row in _models(results).values()) else ""
     count = f"{resamples:,} " if resamples else ""
+    sets = " and ".join(metric.title for name, metric in results.measured.metrics.items() if name in SETS)
+    fewer = results.statistics.set_resamples
+    of_sets = f" ({fewer} for {sets})" if fewer and sets else ""
     lines = [
-        f"95 % intervals from {count}bootstrap samples that draw {drawn}{trainings}; none below {LEAST_UNITS} {unit}"
+        f"95 % intervals from {count}bootstrap samples{of_sets} that draw {drawn}{trainings}; none below {LEAST_UNITS} "
+        f"{unit}"
     ]
-    scenes = len({clip.scene for clip in results.measured.clips})
-    if unit == "clips" and scenes < len(results.measured.clips):
+    clips = results.measured.clips
+    scenes = len({clip.scene for clip in clips})
+    if unit == "clips" and scenes < len(clips):
         lines.append(f"these clips are of {counted(scenes, 'scenes')}, so intervals over clips are too narrow")
+    if unit == "clips" and (shared := sharing_clips(clips)):
+        lines.append(
+            f"{shared} of {counted(len(clips), 'clips')} predict frames that others predict, too: for intervals they "
+            "are fewer than they seem"
+        )
     return Answer("What do the intervals cover?", tuple(lines), len(lines) > 1 or scenes < LEAST_UNITS)
+
+
+def sharing_clips(clips: Sequence[ClipRecord]) -> int:
+    """Number of clips some of whose predicted frames, all but the first, another clip predicts, too."""
+    predicted = [
+        {(clip.data, clip.trajectory, frame) for frame in range(clip.start + 1, clip.start + clip.frames)}
+        for clip in clips
+    ]
+    times = Counter(frame for frames in predicted for frame in frames)
+    return sum(any(times[frame] > 1 for frame in frames) for frames in predicted)
 
 
 def _choices(results: EvalResults) -> Answer:

@@ -68,6 +68,30 @@ def test_training_houses_and_intervals_over_clips_of_few_scenes_are_doubts():
     ].lines  # fmt: skip
 
 
+def test_clips_that_share_frames_are_a_doubt_where_intervals_draw_clips():
+    def overlap(unit):
+        def change(results):
+            results["statistics"] = {"resampled": unit}
+            for number, clip in enumerate(results["measured"]["clips"]):
+                clip |= {"trajectory": "kitchen", "start": 84 + 4 * number, "frames": 9, "scene": "kitchen"}
+
+        return answers(change)["What do the intervals cover?"].lines
+
+    clips = len(example_results()["measured"]["clips"])
+    words = f"{clips} of {clips} clips predict frames that others predict, too"
+    assert overlap("clips")[-1].startswith(words)
+    assert not any("predict" in line for line in overlap("scenes") + answers()["What do the intervals cover?"].lines)
+
+
+def test_the_bootstrap_samples_of_distances_between_sets_are_counted_apart():
+    def change(results):
+        results["statistics"] = {"resampled": "scenes", "resamples": 1000, "set_resamples": 200}
+        results["measured"]["metrics"]["fvd"] = results["measured"]["metrics"]["psnr"] | {"title": "FVD"}
+
+    line = answers(change)["What do the intervals cover?"].lines[0]
+    assert line.startswith("95 % intervals from 1,000 bootstrap samples (200 for FVD) that draw whole scenes")
+
+
 def test_sharpness_stands_beside_psnr_and_noise_is_not_taken_for_it():
     def change(sharpness, grain):
         def measure(results):
