@@ -23,8 +23,8 @@ from persist_cli.metrics.odometry import SIGHTED, TURNS, camera_motions
 HOW = (
     "between the camera's motion from the frame before as the generated colours and depths show it (direct RGB-D "
     "alignment of at most 64 pixels a side, from starts that do not depend on the motion asked for and turn by up to "
-    f"{max(TURNS):g}°) and the motion asked for; NaN where two frames see less than {SIGHTED:.0%} of each other; the "
-    "row of the truth is the error of the estimate"
+    f"{max(TURNS):g}°) and the motion asked for; NaN where less than {SIGHTED:.0%} of a frame has depth, but frames "
+    "that have nothing in common get a wrong motion; the row of the truth is the error of the estimate"
 )
 
 

@@ -21,7 +21,7 @@ from persist_cli.api.observations import Observations
 LEVELS = {16: 6, 32: 4, 64: 2}  # pixels along the longer side, coarse to fine, and rounds of Gauss-Newton
 KEPT = 9, 3  # starts that go on at their costs, and after a few rounds
 TRIALS = 3  # so many
-SIGHTED = 0.25  # share of a frame's pixels that the other must see, or nothing is known of the motion
+SIGHTED = 0.25  # share of a frame's pixels with depth that must lie in the other, or the motion is refused
 
 COLOR, DEPTH = 0.1, 0.1  # of a channel's range and of the depth: a pixel that is so far off counts half
 WHOLE = 0.99  # share of known depth among the four pixels around a place, below which it has none
@@ -63,7 +63,8 @@ def camera_motions(frames: Observations) -> Float[Tensor, "step 4 4"]:
         frames: at least two RGB-D frames; of their cameras only the intrinsics are read.
 
     Returns:
-        Rigid transforms in metres, float64; NaN where two frames do not see enough of the same, or depth is missing.
+        Rigid transforms in metres, float64; NaN where too little depth is known. Frames that have nothing in common get
+        the motion by which they differ least, which says nothing.
     """
     pairs = make_pairs(at_size(frames, min(LEVELS)))
     motions, costs = _from_starts(pairs, start_motions(pairs), LEVELS[min(LEVELS)])

@@ -73,6 +73,13 @@ def test_frames_without_depth_have_no_figure():
         assert metric.measure(missing).isnan().all()
 
 
+def test_frames_that_have_nothing_in_common_get_a_wrong_motion_as_the_definition_says():
+    truth = seen(turns(0.0, 180.0))
+    assert TURNED.measure(prediction(truth.rgb, truth.depth, truth))[1] > 90.0
+    for metric in (TURNED, MOVED):
+        assert "nothing in common get a wrong motion" in metric.definition
+
+
 def test_a_single_frame_has_no_figure():
     truth = seen(turns(0.0))
     assert TURNED.measure(prediction(truth.rgb, truth.depth, truth)).isnan().tolist() == [True]
