@@ -40,7 +40,10 @@ COLUMNS: Final = {
     "success": Column(
         "success", "higher", True, f"the agent stopped within {SUCCESS_METRES:g} m (geodesic) of the goal", "closed"
     ),
-    "spl": Column("SPL", "higher", True, "S · l / max(l, p): S success, l shortest way, p its way, metres", "closed"),
+    "spl": Column(
+        "SPL", "higher", True, "S · l / max(l, p): S success, l metres of the way of fewest actions, p of its way",
+        "closed",
+    ),
     "soft_spl": Column(
         "SoftSPL", "higher", True, "max(0, 1 − d / d₀) · l / max(l, p): d metres left, d₀ at the start", "closed"
     ),
@@ -52,19 +55,26 @@ COLUMNS: Final = {
     "missed_stop": Column("missed stop", "lower", True, "it was so near and never stopped", "closed"),
     "end_metres": Column("metres left", "lower", False, "geodesic metres to the goal at the end", "closed"),
     "collisions": Column("collisions", "lower", False, "actions that the scene refused, an episode", "closed"),
-    "collisions_per_action": Column("collisions/action", "lower", True, "these by all actions", "closed"),
+    "collisions_per_action": Column(
+        "collisions/action", "lower", True, "refused actions of an episode by all of its actions, mean over episodes",
+        "closed",
+    ),
     "actions": Column("actions", None, False, "actions an episode, refused ones included", "closed"),
     "decisions": Column(
         "decisions", None, False,
         "plans and approaches an episode; an approach that stops at once counts too, and imagines nothing", "closed",
     ),
-    "frames_per_decision": Column("frames/decision", None, False, "frames imagined, by all of these", "closed"),
+    "frames_per_decision": Column(
+        "frames/decision", None, False, "an episode's imagined frames by its decisions, mean over episodes", "closed"
+    ),
     "seconds_per_decision": Column(
-        "s/decision", "lower", False, "seconds of proposing, imagining and judging, by all of these", "closed"
+        "s/decision", "lower", False,
+        "an episode's seconds of proposing, imagining and judging by its decisions, mean over episodes", "closed",
     ),
     "writing_per_decision": Column(
         "s/writing", "lower", False,
-        "seconds of writing what was seen to the memory and to the map of the ground, by all of these", "closed",
+        "an episode's seconds of writing what was seen to the memory and to the map of the ground by its decisions, "
+        "mean over episodes", "closed",
     ),
     "ate": Column("ATE", "lower", False, "root mean square of metres to the shortest way, pose by pose", "open"),
     "rpe": Column("RPE", "lower", False, "the same of translations from one pose to the next, metres", "open"),

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from persist_cli.bench.plans.results import compared_with
+import pytest
+
+from persist_cli.bench.plans.results import COLUMNS, compared_with, row_figures
+from persist_cli.episodes.navigation_metrics import WalkRecord, closed_loop_figures
 from persist_cli.episodes.rows import RowChoice
+from persist_cli.evaluate.statistics import Draws
 
 
 def comparisons(
@@ -26,3 +30,12 @@ def test_each_model_is_compared_with_the_simulator_in_its_place_under_the_same_p
     assert compared["rank-16-walk, none"] == ["rank-16, none", "rank-16, simulator"]
     assert compared["rank-8, none"] == ["rank-8, simulator"]
     assert compared["rank-8, simulator"] == ["rank-8, none"]
+
+
+def test_rates_are_means_over_episodes_as_their_definitions_say() -> None:
+    walks = [WalkRecord([2.0] * 3, 0.5, 1, stopped=False), WalkRecord([2.0] * 101, 9.0, 0, stopped=False)]
+    records = [{"closed": {"figures": closed_loop_figures(walk, 2.0)}, "open": None} for walk in walks]
+    figures = row_figures(records, Draws.of([0, 1]))
+    assert figures["collisions_per_action"].mean == pytest.approx((1 / 2 + 0) / 2)  # not 1 of 102
+    for name in (name for name in COLUMNS if name.endswith(("per_action", "per_decision"))):
+        assert "mean over episodes" in COLUMNS[name].definition
