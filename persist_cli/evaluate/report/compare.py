@@ -28,6 +28,12 @@ INTERVAL_LEGEND = (
 )
 
 
+OTHER_MODELS = (
+    "the models differ, and intervals draw {unit}, not trainings: other seeds of the same training may differ as much; "
+    "evaluate both with several in one table (--training-seeds)"
+)
+
+
 @dataclass(frozen=True)
 class ComparedCell:
     """One figure in both runs with the difference B − A.
@@ -57,7 +63,7 @@ class Comparison:
     """Two runs that measured the same clips; ``notes`` say in what else they differ.
 
     ``columns`` has the most important for the protocol first. ``unit`` names what intervals draw: clips only where
-    both runs drew clips.
+    both runs drew clips. ``same_models`` says whether both runs are of the same checkpoints.
     """
 
     a: str
@@ -66,6 +72,7 @@ class Comparison:
     tables: list[ComparedTable]
     notes: list[str]
     unit: str
+    same_models: bool = True
 
     @property
     def cells(self) -> list[ComparedCell]:
@@ -73,9 +80,14 @@ class Comparison:
         return [cell for table in self.tables for row in table.rows.values() for cell in row.values()]
 
     @property
+    def has_intervals(self) -> bool:
+        """Whether any difference has an interval."""
+        return any(cell.low is not None for cell in self.cells)
+
+    @property
     def legend(self) -> str:
         """What a difference is, and that there is no interval where the clips are too few."""
-        if any(cell.low is not None for cell in self.cells):
+        if self.has_intervals:
             return INTERVAL_LEGEND.format(unit=self.unit)
         few = max((cell.pairs for cell in self.cells if cell.pairs < LEAST_UNITS), default=0)
         return f"{MEAN_LEGEND}; {too_few(few, self.unit)}" if few else MEAN_LEGEND
@@ -115,7 +127,8 @@ def compare_runs(a: Path, b: Path) -> Comparison:
     tables = list(_compared_tables(one, two, columns))
     if not any(table.rows for table in tables) or not columns:
         raise DataError(f"{a} and {b} have no {'row' if columns else 'column'} in common")
-    return Comparison(str(a), str(b), columns, tables, differing_notes(one, two), _drawn_unit(one, two))
+    same_models = _model_hashes(one) == _model_hashes(two)
+    return Comparison(str(a), str(b), columns, tables, differing_notes(one, two), _drawn_unit(one, two), same_models)
 
 
 def run_compare(a: Path, b: Path, json: bool, out: Path | None) -> None:
@@ -198,6 +211,11 @@ def _drawn_unit(one: EvalResults, two: EvalResults) -> str:
     return "clips" if {one.statistics.resampled, two.statistics.resampled} == {"clips"} else "scenes"
 
 
+def _model_hashes(results: EvalResults) -> set[tuple[str, ...]]:
+    """The hashes of each checkpoint's parts."""
+    return {(record.fingerprint, *sorted(record.adapters.values())) for record in results.checkpoints}
+
+
 def _compared_tables(one: EvalResults, two: EvalResults, columns: dict[str, ColumnRecord]) -> Iterator[ComparedTable]:
     for table_a, table_b in zip(one.tables, two.tables, strict=True):
         clips = [one.measured.clips[number] for number in table_a.clips]
@@ -240,4 +258,6 @@ def _gap(cell: ComparedCell, digits: int) -> str:
 def _remarks(comparison: Comparison) -> list[str]:
     notes = [f"differs: {note}" for note in comparison.notes]
     left_out = [f"left out: {', '.join(comparison.left_out)} (neither run has them)"] if comparison.left_out else []
-    return [f"A: {comparison.a}", f"B: {comparison.b}", comparison.legend, *left_out, *notes]
+    trainings = comparison.has_intervals and not comparison.same_models
+    trained = [OTHER_MODELS.format(unit=comparison.unit)] if trainings else []
+    return [f"A: {comparison.a}", f"B: {comparison.b}", comparison.legend, *trained, *left_out, *notes]

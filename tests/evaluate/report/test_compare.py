@@ -97,6 +97,23 @@ def test_runs_of_five_clips_are_compared_without_intervals_and_say_why(tmp_path,
     assert comparison["tables"][0]["rows"]["voxel"]["psnr"]["low"] is None
 
 
+def test_intervals_of_two_models_say_that_they_hold_no_other_trainings(tmp_path, capsys):
+    def trained_again(results):
+        add_one_decibel(results)
+        results["checkpoints"][0]["fingerprint"] = "b" * 64
+
+    a, b, c = (
+        write_results(tmp_path, name, change)
+        for name, change in (("a", lambda results: None), ("b", trained_again), ("c", add_one_decibel))
+    )
+    run_compare(a, b, False, tmp_path / "out")
+    words = "the models differ, and intervals draw clips, not trainings"
+    for text in (capsys.readouterr().out, (tmp_path / "out/compare.md").read_text()):
+        assert words in " ".join(text.split())
+    run_compare(a, c, False, None)
+    assert words not in " ".join(capsys.readouterr().out.split())
+
+
 def test_without_figures_clip_by_clip_there_is_a_difference_of_means_and_no_interval(tmp_path):
     def change(results):
         add_one_decibel(results)
