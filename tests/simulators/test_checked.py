@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,30 +25,13 @@ from persist_cli.simulators.collect import CollectPlan, run_collect
 from tests.support.packages import install
 
 PLAN = CollectPlan(simulator="hall", scenes="0:2", frames=24, size="8x8")
+SIZE = {"height": 8, "width": 8}
 SIDE = 4.0  # metres from the middle of the hall to its walls
-
-
-@dataclass(frozen=True)
-class HallSettings:
-    """As those of any agent, under which no camera height is.
-
-    Args:
-        height: image height in pixels.
-        width: image width in pixels.
-        step: length of a step in metres.
-        turn: angle of a turn in degrees.
-    """
-
-    height: int = 8
-    width: int = 8
-    step: float = 0.25
-    turn: float = 15.0
 
 
 class Hall(Simulator):
     """A dark empty hall, y up; it answers as a test says."""
 
-    settings_type = HallSettings
     wrong: dict[str, Any] = {}  # noqa: RUF012  # set by a test: answers in the place of its own
 
     def open_scene(self, scene):
@@ -220,7 +203,7 @@ def test_the_search_for_episodes_checks_its_simulator(hall, tmp_path: Path, monk
 
 
 def test_a_simulator_as_a_model_is_checked(hall, monkeypatch: pytest.MonkeyPatch) -> None:
-    simulator = checked_simulator("hall", {})
+    simulator = checked_simulator("hall", SIZE)
     simulator.open_scene(0)
     simulator.place((0.0, 0.0), 0.0)
     future = SimulatorFutures(simulator)
@@ -234,7 +217,7 @@ def test_depth_that_is_none_is_missing_as_in_the_store(hall, monkeypatch: pytest
     depth = np.full((8, 8), 2.0, np.float32)
     depth[:3] = np.array([math.inf, math.nan, -1.0])[:, None]
     monkeypatch.setattr(Hall, "wrong", {"frame": {"depth": depth}})
-    simulator = checked_simulator("hall", {})
+    simulator = checked_simulator("hall", SIZE)
     simulator.open_scene(0)
     simulator.place((0.0, 0.0), 0.0)
     seen = simulator.observe().depth
@@ -243,7 +226,7 @@ def test_depth_that_is_none_is_missing_as_in_the_store(hall, monkeypatch: pytest
 
 
 def test_a_stance_that_is_none_is_refused(hall, monkeypatch: pytest.MonkeyPatch) -> None:
-    simulator = checked_simulator("hall", {})
+    simulator = checked_simulator("hall", SIZE)
     assert simulator.stance(np.eye(4)) is None
     monkeypatch.setattr(Hall, "stance", lambda self, pose: (0.0, 0.0, 0.0))
     with pytest.raises(PluginError, match=r"is broken: stance\(\) returned \(0.0, 0.0, 0.0\), not \(\(x, y\)"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import os
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -176,6 +177,24 @@ class Capture:
         """A short hash of the names and sizes of all files."""
         text = "\n".join(f"{path.name} {path.stat().st_size}" for path in self.files if path.is_file())
         return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def folders_with(marker: str, source: Path, wanted: str) -> list[Path]:
+    """The folder itself where something of this name is in it, else the folders in it that have it, by name.
+
+    Args:
+        marker: name of a file or folder that every recording of the format has.
+        source: a recording, or a folder of recordings.
+        wanted: what is not there, in words, where there is no recording.
+
+    Raises:
+        DataError: when there is none.
+    """
+    source = Path(os.path.abspath(source))  # a link keeps its own name
+    folders = [source] if (source / marker).exists() else sorted(path.parent for path in source.glob(f"*/{marker}"))
+    if not folders:
+        raise DataError(f"{source}: neither {wanted}")
+    return folders
 
 
 def world_up_of(captures: Sequence[Capture]) -> tuple[Direction, str]:

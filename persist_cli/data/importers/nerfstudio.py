@@ -7,7 +7,6 @@ fewer pixels than the colours, which are then resampled to them. Distortion is u
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -23,10 +22,12 @@ from persist_cli.data.importers.captures import (
     CapturedFrame,
     DepthUnits,
     checked_pose,
+    folders_with,
     numbered,
 )
 from persist_cli.data.importers.lenses import Array, Lens
 from persist_cli.errors import DataError
+from persist_cli.io.files import read_json
 
 TRANSFORMS: Final = "transforms.json"
 OPENCV_FROM_OPENGL: Final = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -43,12 +44,11 @@ class Nerfstudio(Importer):
         Raises:
             DataError: when there is none, or what a whole capture needs is missing or wrong.
         """
-        source = Path(os.path.abspath(source))  # a link keeps its own name
-        files = [source] if source.is_file() else [source / TRANSFORMS]
-        if not files[0].is_file():
-            files = sorted(source.glob(f"*/{TRANSFORMS}"))
-        if not files:
-            raise DataError(f"{source}: neither {TRANSFORMS} in it nor folders with one")
+        if source.is_file():
+            files = [Path(os.path.abspath(source))]
+        else:
+            folders = folders_with(TRANSFORMS, source, f"{TRANSFORMS} in it nor folders with one")
+            files = [folder / TRANSFORMS for folder in folders]
         for file in files:
             yield read_transforms(file).trajectory((Z_UP, BY_FORMAT))
 
@@ -76,10 +76,7 @@ def read_transforms(file: Path) -> Capture:
 
 def _read(file: Path) -> Mapping[str, Any]:
     """The values of the file, with a list of frames that name their images."""
-    try:
-        values = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise DataError(f"{file}: not a JSON file ({error})") from error
+    values = read_json(file, DataError)
     frames = values.get("frames") if isinstance(values, dict) else None
     if not isinstance(values, dict) or not isinstance(frames, list) or not frames:
         raise DataError(f"{file}: it lists no frames")

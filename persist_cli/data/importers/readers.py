@@ -13,6 +13,7 @@ from persist_cli.api.cameras import check_intrinsics
 from persist_cli.data.importers.lenses import Lens
 from persist_cli.errors import DataError
 
+INTRINSICS: Final = "camera-intrinsics.txt"  # a 3×3 matrix beside recordings whose format has none
 LEAST_SKEW: Final = 1e-3  # pixels
 
 

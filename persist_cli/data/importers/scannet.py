@@ -7,7 +7,6 @@ matrices count pixels from the centre of the top-left one.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
@@ -21,6 +20,7 @@ from persist_cli.data.importers.captures import (
     Capture,
     CapturedFrame,
     DepthUnits,
+    folders_with,
     numbered,
     read_pose,
 )
@@ -28,7 +28,6 @@ from persist_cli.data.importers.lenses import Lens
 from persist_cli.data.importers.readers import read_color, read_lens, read_matrix
 from persist_cli.errors import DataError
 
-FOLDERS: Final = ("color", "depth", "pose")
 SUFFIXES: Final = {"depth": "png", "pose": "txt"}
 IMAGES: Final = (".jpg", ".jpeg", ".png")
 FRAMES_PER_SECOND: Final = 30.0
@@ -45,11 +44,7 @@ class ScanNet(Importer):
         Raises:
             DataError: when there is none, or what a whole scan needs is missing or wrong.
         """
-        source = Path(os.path.abspath(source))  # a link keeps its own name
-        folders = [source] if (source / "pose").is_dir() else sorted(path.parent for path in source.glob("*/pose"))
-        if not folders:
-            raise DataError(f"{source}: neither color, depth and pose folders in it nor scans that have them")
-        for folder in folders:
+        for folder in folders_with("pose", source, "color, depth and pose folders in it nor scans that have them"):
             yield read_scan(folder).trajectory((Z_UP, BY_FORMAT))
 
 

@@ -17,10 +17,9 @@ from persist_cli.api.importer import ForeignTrajectory, Importer
 from persist_cli.data.importers.captures import Capture, CapturedFrame, DepthUnits, numbered, read_pose, world_up_of
 from persist_cli.data.importers.gravity import Direction
 from persist_cli.data.importers.lenses import Lens
-from persist_cli.data.importers.readers import read_lens
+from persist_cli.data.importers.readers import INTRINSICS, read_lens
 from persist_cli.errors import DataError
 
-INTRINSICS = "camera-intrinsics.txt"
 FRAME = re.compile(r"^(?P<stem>frame-\d+)\.(?P<part>color\.jpg|color\.png|depth\.png|pose\.txt)$")
 SEQUENCE = re.compile(r"^seq-?\d+$")
 UNITS = DepthUnits(1000.0, (0, 65535))

@@ -11,7 +11,6 @@ distortion of the first two, which is undone; for other recordings ``camera-intr
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -22,13 +21,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from persist_cli.api.importer import ForeignTrajectory, Importer
-from persist_cli.data.importers.captures import BY_FORMAT, Z_UP, Capture, CapturedFrame, DepthUnits
+from persist_cli.data.importers.captures import BY_FORMAT, Z_UP, Capture, CapturedFrame, DepthUnits, folders_with
 from persist_cli.data.importers.lenses import Array, Lens
-from persist_cli.data.importers.readers import read_lens
+from persist_cli.data.importers.readers import INTRINSICS, read_lens
 from persist_cli.errors import DataError
 
 LISTS: Final = ("rgb.txt", "depth.txt", "groundtruth.txt")
-INTRINSICS: Final = "camera-intrinsics.txt"
 NEAR: Final = 0.02  # seconds within which things belong together
 LONGEST_GAP: Final = 0.1  # seconds between two true poses that one between them is interpolated from
 UNITS: Final = DepthUnits(5000.0)
@@ -63,13 +61,7 @@ class TumRgbd(Importer):
         Raises:
             DataError: when there is none, or what a whole recording needs is missing or wrong.
         """
-        source = Path(os.path.abspath(source))  # a link keeps its own name
-        folders = (
-            [source] if (source / LISTS[0]).is_file() else sorted(path.parent for path in source.glob("*/rgb.txt"))
-        )
-        if not folders:
-            raise DataError(f"{source}: neither {', '.join(LISTS)} in it nor folders with them")
-        for folder in folders:
+        for folder in folders_with(LISTS[0], source, f"{', '.join(LISTS)} in it nor folders with them"):
             yield read_recording(folder).trajectory((Z_UP, BY_FORMAT))
 
 
