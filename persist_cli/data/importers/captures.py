@@ -13,6 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from persist_cli.api.actions import FREE, free_motion
 from persist_cli.api.cameras import check_intrinsics, check_pose
@@ -21,12 +22,14 @@ from persist_cli.api.observations import Frame, TrajectoryInfo
 from persist_cli.data.importers.checking import FIT_NAME, is_fit_name
 from persist_cli.data.importers.gravity import FROM_CAMERAS, FROM_SURFACES, Direction, estimate_up, level_up
 from persist_cli.data.importers.lenses import Array, Lens, Size, retake, undistort
-from persist_cli.data.importers.readers import read_color, read_depth, read_matrix
+from persist_cli.data.importers.readers import StoredImage, read_matrix
+from persist_cli.data.importers.turning import QuarterTurns
 from persist_cli.errors import DataError
 
 FRAMES_FOR_UP: Final = 20  # whose depth shows which way is up
-Z_UP: Final[Direction] = (0.0, 0.0, 1.0)
-BY_FORMAT: Final = "z, as the format has it"  # what the source of a trajectory says of its up axis
+Y_UP: Final[tuple[Direction, str]] = (0.0, 1.0, 0.0), "y, as the format has it"
+Z_UP: Final[tuple[Direction, str]] = (0.0, 0.0, 1.0), "z, as the format has it"
+OPENCV_FROM_OPENGL: Final = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -34,33 +37,20 @@ class CapturedFrame:
     """A frame whose images are not read yet.
 
     Args:
-        color: file of the colour image.
-        depth: file of the depth image.
+        color: the colour image.
+        depth: the depth image.
         pose: world_from_camera ``[4, 4]``, OpenCV axes, metres; or why it cannot be used.
         lens: of the colour image.
         depth_lens: of the depth image; ``None`` where both images have the same pixels, in all frames.
         seconds: since any fixed time.
     """
 
-    color: Path
-    depth: Path
+    color: StoredImage
+    depth: StoredImage
     pose: Array | DataError
     lens: Lens
     depth_lens: Lens | None = None
     seconds: float = 0.0
-
-
-@dataclass(frozen=True)
-class DepthUnits:
-    """What the numbers of a depth image mean.
-
-    Args:
-        per_metre: 1000 for millimetres.
-        missing: raw values without depth.
-    """
-
-    per_metre: float = 1000.0
-    missing: tuple[int, ...] = (0,)
 
 
 @dataclass(frozen=True)
@@ -71,7 +61,6 @@ class Capture:
         folder: where its files are, which messages name.
         scene: name of the world.
         frames: in order.
-        units: of its depth.
         files: all files, whose names and sizes tell this recording from a mended or another one.
         source: what is kept of where it comes from, beside these.
         part: name of this recording of the scene; empty where it is the only one.
@@ -80,7 +69,6 @@ class Capture:
     folder: Path
     scene: str
     frames: Sequence[CapturedFrame]
-    units: DepthUnits
     files: Sequence[Path]
     source: dict[str, Any] = field(default_factory=dict)
     part: str = ""
@@ -111,7 +99,9 @@ class Capture:
             raise DataError(
                 f"{self.folder}: rename the folder, since its trajectory cannot be named {name!r}; {FIT_NAME}"
             )
-        lens, (height, width) = self._camera()
+        turns = QuarterTurns.upright(np.stack([np.asarray(frame.pose) for frame in self.posed]), up[0])
+        own = self._camera()
+        lens, (height, width) = turns.camera(*own)
         info = TrajectoryInfo(
             scene=self.scene,
             intrinsics=lens.matrix,
@@ -119,9 +109,14 @@ class Capture:
             width=width,
             world_up=up[0],
             vocabulary=free_motion(),
-            source={**self.source, "folder": self.folder.name, "world_up": up[1], "files": self._digest()},
+            source={
+                **self.source,
+                "folder": self.folder.name,
+                "world_up": f"{up[1]}{turns.note}",
+                "files": self._digest(),
+            },
         )
-        return ForeignTrajectory(name, info, self._read(lens, info), len(self.frames))
+        return ForeignTrajectory(name, info, self._read(*own, turns), len(self.frames))
 
     def _camera(self) -> tuple[Lens, Size]:
         """Lens and size of the images of the first frame that can be read; ``DataError`` of the first when none can."""
@@ -138,39 +133,43 @@ class Capture:
 
     def _grid(self, frame: CapturedFrame) -> tuple[Lens, Size]:
         """The pixels that a frame has depth for: lens, without distortion, and size."""
-        color = read_color(frame.color)
+        color = frame.color.read()
         if frame.depth_lens is None:
             return lens_of(frame.color, frame.lens, color).undistorted, (color.shape[0], color.shape[1])
-        depth = read_depth(frame.depth, self.units.per_metre)
+        depth = frame.depth.read()
         return lens_of(frame.depth, frame.depth_lens, depth).undistorted, (depth.shape[0], depth.shape[1])
 
-    def _read(self, lens: Lens, info: TrajectoryInfo) -> Iterator[Frame | DataError]:
+    def _read(self, lens: Lens, size: Size, turns: QuarterTurns) -> Iterator[Frame | DataError]:
         for position, frame in enumerate(self.frames):
             if isinstance(frame.pose, DataError):
                 yield frame.pose
                 continue
             try:
-                rgb, depth = self._images(frame, lens, (info.height, info.width))
+                rgb, depth = (turns.image(image) for image in self._images(frame, lens, size))
             except DataError as error:
                 yield error
                 continue
-            yield Frame(rgb, depth, frame.pose, FREE if position + 1 < len(self.frames) else None, frame.seconds)
+            action = FREE if position + 1 < len(self.frames) else None
+            yield Frame(rgb, depth, turns.pose(frame.pose), action, frame.seconds)
 
     def _images(self, frame: CapturedFrame, lens: Lens, size: Size) -> tuple[Array, Array]:
         """Colour and depth of a frame by the trajectory's camera; ``DataError`` naming the one that cannot be used."""
-        rgb, depth = read_color(frame.color), read_depth(frame.depth, self.units.per_metre, self.units.missing)
+        rgb, depth = frame.color.read(), frame.depth.read()
         if frame.depth_lens is None:
-            for path, image in ((frame.color, rgb), (frame.depth, depth)):
+            for stored, image in ((frame.color, rgb), (frame.depth, depth)):
                 if image.shape[:2] != size:
                     found = f"{image.shape[0]}×{image.shape[1]}"
-                    raise DataError(f"{path}: {found} pixels, the first colour image has {size[0]}×{size[1]}")
+                    raise DataError(f"{stored}: {found} pixels, the first colour image has {size[0]}×{size[1]}")
         taken = []
-        for path, image, own in ((frame.color, rgb, frame.lens), (frame.depth, depth, frame.depth_lens or frame.lens)):
-            here = lens_of(path, own, image)
+        for stored, image, own in (
+            (frame.color, rgb, frame.lens),
+            (frame.depth, depth, frame.depth_lens or frame.lens),
+        ):
+            here = lens_of(stored, own, image)
             try:
                 taken.append(retake(undistort(image, here), here, lens, size))
             except DataError as error:
-                raise DataError(f"{path}: {error}") from error
+                raise DataError(f"{stored}: {error}") from error
         return taken[0], taken[1]
 
     def _digest(self) -> str:
@@ -199,25 +198,25 @@ def folders_with(marker: str, source: Path, wanted: str) -> list[Path]:
 
 def world_up_of(captures: Sequence[Capture]) -> tuple[Direction, str]:
     """The direction up in the world of some captures, from their cameras and depth, and what it rests on."""
-    posed = [(frame, capture.units) for capture in captures for frame in capture.posed]
-    up = estimate_up(np.stack([np.asarray(frame.pose) for frame, _ in posed]))
+    posed = [frame for capture in captures for frame in capture.posed]
+    up = estimate_up(np.stack([np.asarray(frame.pose) for frame in posed]))
     chosen = np.linspace(0, len(posed) - 1, min(FRAMES_FOR_UP, len(posed))).round().astype(int)
     views = []
-    for frame, units in (posed[number] for number in chosen):
+    for frame in (posed[number] for number in chosen):
         with contextlib.suppress(DataError):  # the frame itself is reported when its turn comes
-            depth = read_depth(frame.depth, units.per_metre, units.missing)
+            depth = frame.depth.read()
             lens = lens_of(frame.depth, frame.depth_lens or frame.lens, depth)
             views.append((depth, np.asarray(frame.pose), lens.matrix))
     level = level_up(up, views)
     return (up, FROM_CAMERAS) if level is None else (level, FROM_SURFACES)
 
 
-def lens_of(path: Path, lens: Lens, image: Array) -> Lens:
-    """The lens of the image in a file; ``DataError`` naming the file when it is of images of another aspect."""
+def lens_of(stored: StoredImage, lens: Lens, image: Array) -> Lens:
+    """The lens of an image that was read; ``DataError`` naming it when the lens is of images of another aspect."""
     try:
         return lens.of((image.shape[0], image.shape[1]))
     except DataError as error:
-        raise DataError(f"{path}: {error}") from error
+        raise DataError(f"{stored}: {error}") from error
 
 
 def read_pose(path: Path) -> Array | DataError:
@@ -232,6 +231,19 @@ def checked_pose(pose: Array, where: str) -> Array:
     """The pose ``[4, 4]``; ``DataError``, which begins with ``where``, when it is none."""
     check_pose(torch.from_numpy(pose), where)
     return pose
+
+
+def quaternion_pose(numbers: Sequence[float], where: str) -> Array | DataError:
+    """The pose ``[4, 4]`` of ``x, y, z, qx, qy, qz, qw``, or the error, which begins with ``where``."""
+    pose = np.eye(4)
+    try:
+        pose[:3, 3] = numbers[:3]
+        pose[:3, :3] = Rotation.from_quat(np.array(numbers[3:], dtype=np.float64)).as_matrix()
+        return checked_pose(pose, where)
+    except (TypeError, ValueError) as error:
+        return DataError(f"{where} is no pose ({error})")
+    except DataError as error:
+        return error
 
 
 def numbered(name: str) -> tuple[tuple[int, ...], str]:

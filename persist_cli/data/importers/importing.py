@@ -204,7 +204,7 @@ def run_import(format: str, source: Path, out: Path, plan: ImportPlan, json: boo
         for part, folder in plan.parts(out)
     ]
     rows = [row for part in reversed(written) for row in part]
-    unsure = [row["name"] for row in rows if row["world_up_is"] == FROM_CAMERAS]
+    unsure = [row["name"] for row in rows if row["world_up_is"].startswith(FROM_CAMERAS)]
     if unsure:
         warn(
             f"no level surface was found in {', '.join(unsure)}: up is only guessed from how people hold cameras; "

@@ -16,21 +16,20 @@ import numpy as np
 
 from persist_cli.api.importer import ForeignTrajectory, Importer
 from persist_cli.data.importers.captures import (
-    BY_FORMAT,
+    OPENCV_FROM_OPENGL,
     Z_UP,
     Capture,
     CapturedFrame,
-    DepthUnits,
     checked_pose,
     folders_with,
     numbered,
 )
 from persist_cli.data.importers.lenses import Array, Lens
+from persist_cli.data.importers.readers import color_file, depth_file
 from persist_cli.errors import DataError
 from persist_cli.io.files import read_json
 
 TRANSFORMS: Final = "transforms.json"
-OPENCV_FROM_OPENGL: Final = np.diag([1.0, -1.0, -1.0, 1.0])
 PINHOLES: Final = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
 DISTORTION: Final = ("k1", "k2", "p1", "p2", "k3")  # in OpenCV's order
 
@@ -50,7 +49,7 @@ class Nerfstudio(Importer):
             folders = folders_with(TRANSFORMS, source, f"{TRANSFORMS} in it nor folders with one")
             files = [folder / TRANSFORMS for folder in folders]
         for file in files:
-            yield read_transforms(file).trajectory((Z_UP, BY_FORMAT))
+            yield read_transforms(file).trajectory(Z_UP)
 
 
 def read_transforms(file: Path) -> Capture:
@@ -69,9 +68,10 @@ def read_transforms(file: Path) -> Capture:
     for position, (frame, depth) in enumerate(zip(listed, depths, strict=True)):
         color, lens = folder / str(frame["file_path"]), _lens({**values, **frame}, file)
         pose = _pose(frame, f"{file}: {frame['file_path']}") if depth else DataError(f"{color}: no depth_file_path")
-        frames.append(CapturedFrame(color, folder / str(depth), pose, lens, lens, float(position)))
-    files = [file, *(path for frame in frames for path in (frame.color, frame.depth))]
-    return Capture(folder, folder.name, frames, DepthUnits(), files, {"format": "nerfstudio"})
+        images = color_file(color), depth_file(folder / str(depth))
+        frames.append(CapturedFrame(*images, pose, lens, lens, float(position)))
+    files = [file, *(image.path for frame in frames for image in (frame.color, frame.depth))]
+    return Capture(folder, folder.name, frames, files, {"format": "nerfstudio"})
 
 
 def _read(file: Path) -> Mapping[str, Any]:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import io
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,6 +19,37 @@ from persist_cli.errors import DataError
 
 INTRINSICS: Final = "camera-intrinsics.txt"  # a 3×3 matrix beside recordings whose format has none
 LEAST_SKEW: Final = 1e-3  # pixels
+UNSURE: Final = 0  # the lowest level of confidence
+
+
+@dataclass(frozen=True)
+class StoredImage:
+    """An image in a file, an archive or a video, which is not read yet.
+
+    Args:
+        path: the file.
+        read: returns colours, uint8 ``[height, width, 3]``, or depth in metres, float32 ``[height, width]``, 0 where
+            there is none; ``DataError`` naming the image when it cannot be read.
+        place: where in the file it is, in words; empty where it is the whole file.
+    """
+
+    path: Path
+    read: Callable[[], np.ndarray[Any, Any]]
+    place: str = ""
+
+    def __str__(self) -> str:
+        """What messages call it."""
+        return f"{self.path}: {self.place}" if self.place else str(self.path)
+
+
+def color_file(path: Path) -> StoredImage:
+    """The colour image of a file."""
+    return StoredImage(path, partial(read_color, path))
+
+
+def depth_file(path: Path, units_per_metre: float = 1000.0, missing: tuple[int, ...] = (0,)) -> StoredImage:
+    """The depth image of a file; the arguments are those of ``read_depth``."""
+    return StoredImage(path, partial(read_depth, path, units_per_metre, missing))
 
 
 def read_color(path: Path) -> np.ndarray[Any, Any]:
@@ -24,6 +59,23 @@ def read_color(path: Path) -> np.ndarray[Any, Any]:
         DataError: when it is missing, truncated, no image, or one of 32-bit numbers, whose white nobody knows.
     """
     return _eight_bits(_read_image(path), path)
+
+
+def decode_color(data: bytes, name: str) -> np.ndarray[Any, Any]:
+    """The same of the bytes of an image that messages call ``name``."""
+    return _eight_bits(_read_image(io.BytesIO(data), name), name)
+
+
+def read_levels(path: Path) -> np.ndarray[Any, Any]:
+    """The ``[height, width]`` integers of a one-channel image, as of confidence.
+
+    Raises:
+        DataError: when it is missing, truncated or has several channels.
+    """
+    raw = np.array(_read_image(path))
+    if raw.ndim != 2 or not np.issubdtype(raw.dtype, np.integer):
+        raise DataError(f"{path}: must have one integer channel, has {raw.dtype} {list(raw.shape)}")
+    return raw
 
 
 def read_photo(path: Path) -> np.ndarray[Any, Any]:
@@ -51,22 +103,31 @@ def read_depth(path: Path, units_per_metre: float, missing: tuple[int, ...] = (0
     Raises:
         DataError: when it is missing, truncated or has several channels.
     """
-    raw = np.array(_read_image(path))
-    if raw.ndim != 2 or not np.issubdtype(raw.dtype, np.integer):
-        raise DataError(f"{path}: a depth image must have one integer channel, this has {raw.dtype} {list(raw.shape)}")
+    raw = read_levels(path)
     depth = raw.astype(np.float32) / np.float32(units_per_metre)
     depth[np.isin(raw, missing)] = 0.0
     return depth
 
 
+def sure_depth(depth: np.ndarray[Any, Any], confidence: np.ndarray[Any, Any], name: str) -> np.ndarray[Any, Any]:
+    """Depth ``[height, width]`` of a phone, 0 also where its confidence is the lowest of three levels.
+
+    Raises:
+        DataError: when confidence, which is called ``name``, has another number of pixels.
+    """
+    if confidence.shape != depth.shape:
+        raise DataError(f"{name}: {list(confidence.shape)} pixels, its depth image has {list(depth.shape)}")
+    return np.where(confidence == UNSURE, np.float32(0), depth)
+
+
 def read_matrix(path: Path, rows: int, columns: int) -> np.ndarray[Any, Any]:
-    """The float64 ``[rows, columns]`` matrix of a text file of numbers.
+    """The float64 ``[rows, columns]`` matrix of a text file of numbers, with spaces or commas between them.
 
     Raises:
         DataError: when it is missing, or holds another count of numbers or anything else.
     """
     try:
-        numbers = np.array([float(word) for word in path.read_text(encoding="utf-8").split()])
+        numbers = np.array([float(word) for word in path.read_text(encoding="utf-8").replace(",", " ").split()])
     except FileNotFoundError as error:
         raise DataError(f"{path}: no such file") from error
     except (ValueError, OSError) as error:
@@ -89,7 +150,7 @@ def read_lens(path: Path, rows: int) -> Lens:
     return Lens.of_pixel_centres(matrix)
 
 
-def _eight_bits(image: Image.Image, path: Path) -> np.ndarray[Any, Any]:
+def _eight_bits(image: Image.Image, path: Path | str) -> np.ndarray[Any, Any]:
     """The RGB of an image; Pillow itself would make white of every grey value of 16 bits above 255."""
     if image.mode in ("I", "F"):
         raise DataError(f"{path}: a colour image of 32-bit numbers; save it with 8 or 16 bits a channel")
@@ -99,12 +160,13 @@ def _eight_bits(image: Image.Image, path: Path) -> np.ndarray[Any, Any]:
     return np.array(image.convert("RGB"))
 
 
-def _read_image(path: Path) -> Image.Image:
+def _read_image(file: Path | io.BytesIO, name: str = "") -> Image.Image:
+    name = name or str(file)
     try:
-        with Image.open(path) as image:
+        with Image.open(file) as image:
             image.load()
             return image
     except FileNotFoundError as error:
-        raise DataError(f"{path}: no such file") from error
+        raise DataError(f"{name}: no such file") from error
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise DataError(f"{path}: not a whole image ({error})") from error
+        raise DataError(f"{name}: not a whole image ({error})") from error

@@ -15,17 +15,15 @@ import numpy as np
 
 from persist_cli.api.importer import ForeignTrajectory, Importer
 from persist_cli.data.importers.captures import (
-    BY_FORMAT,
     Z_UP,
     Capture,
     CapturedFrame,
-    DepthUnits,
     folders_with,
     numbered,
     read_pose,
 )
 from persist_cli.data.importers.lenses import Lens
-from persist_cli.data.importers.readers import read_color, read_lens, read_matrix
+from persist_cli.data.importers.readers import color_file, depth_file, read_color, read_lens, read_matrix
 from persist_cli.errors import DataError
 
 SUFFIXES: Final = {"depth": "png", "pose": "txt"}
@@ -45,7 +43,7 @@ class ScanNet(Importer):
             DataError: when there is none, or what a whole scan needs is missing or wrong.
         """
         for folder in folders_with("pose", source, "color, depth and pose folders in it nor scans that have them"):
-            yield read_scan(folder).trajectory((Z_UP, BY_FORMAT))
+            yield read_scan(folder).trajectory(Z_UP)
 
 
 def read_scan(folder: Path) -> Capture:
@@ -66,12 +64,12 @@ def read_scan(folder: Path) -> Capture:
         for stem in stems
     ]
     frames = [
-        CapturedFrame(color, depth, read_pose(pose), lens, depth_lens, position / FRAMES_PER_SECOND)
+        CapturedFrame(
+            color_file(color), depth_file(depth), read_pose(pose), lens, depth_lens, position / FRAMES_PER_SECOND
+        )
         for position, (color, depth, pose) in enumerate(files)
     ]
-    return Capture(
-        folder, folder.name, frames, DepthUnits(), [path for each in files for path in each], {"format": "scannet"}
-    )
+    return Capture(folder, folder.name, frames, [path for each in files for path in each], {"format": "scannet"})
 
 
 def _listed(folder: Path) -> list[Path]:

@@ -14,15 +14,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from persist_cli.api.importer import ForeignTrajectory, Importer
-from persist_cli.data.importers.captures import Capture, CapturedFrame, DepthUnits, numbered, read_pose, world_up_of
+from persist_cli.data.importers.captures import Capture, CapturedFrame, numbered, read_pose, world_up_of
 from persist_cli.data.importers.gravity import Direction
 from persist_cli.data.importers.lenses import Lens
-from persist_cli.data.importers.readers import INTRINSICS, read_lens
+from persist_cli.data.importers.readers import INTRINSICS, color_file, depth_file, read_lens
 from persist_cli.errors import DataError
 
 FRAME = re.compile(r"^(?P<stem>frame-\d+)\.(?P<part>color\.jpg|color\.png|depth\.png|pose\.txt)$")
 SEQUENCE = re.compile(r"^seq-?\d+$")
-UNITS = DepthUnits(1000.0, (0, 65535))
+MISSING = (0, 65535)  # raw values without depth, which is in millimetres
 FRAMES_PER_SECOND = 30.0
 
 
@@ -62,10 +62,15 @@ def read_sequence(folder: Path) -> Capture:
         scene=folder.parent.name if is_part else folder.name,
         part=folder.name if is_part else "",
         frames=[
-            CapturedFrame(paths["color"], paths["depth"], pose, lens, seconds=(number - first) / FRAMES_PER_SECOND)
+            CapturedFrame(
+                color_file(paths["color"]),
+                depth_file(paths["depth"], missing=MISSING),
+                pose,
+                lens,
+                seconds=(number - first) / FRAMES_PER_SECOND,
+            )
             for (number, paths), pose in zip(files, poses, strict=True)
         ],
-        units=UNITS,
         files=[path for _, paths in files for path in paths.values()],
         source={"format": "7scenes"},
     )

@@ -21,15 +21,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from persist_cli.api.importer import ForeignTrajectory, Importer
-from persist_cli.data.importers.captures import BY_FORMAT, Z_UP, Capture, CapturedFrame, DepthUnits, folders_with
+from persist_cli.data.importers.captures import Z_UP, Capture, CapturedFrame, folders_with
 from persist_cli.data.importers.lenses import Array, Lens
-from persist_cli.data.importers.readers import INTRINSICS, read_lens
+from persist_cli.data.importers.readers import INTRINSICS, color_file, depth_file, read_lens
 from persist_cli.errors import DataError
 
 LISTS: Final = ("rgb.txt", "depth.txt", "groundtruth.txt")
 NEAR: Final = 0.02  # seconds within which things belong together
 LONGEST_GAP: Final = 0.1  # seconds between two true poses that one between them is interpolated from
-UNITS: Final = DepthUnits(5000.0)
+PER_METRE: Final = 5000.0  # units of depth
 SIZE: Final = (480, 640)
 CAMERA: Final = re.compile(r"freiburg([123])")
 PUBLISHED: Final = {  # fx, fy, cx, cy from pixel centres, and the distortion, of the colour cameras
@@ -62,7 +62,7 @@ class TumRgbd(Importer):
             DataError: when there is none, or what a whole recording needs is missing or wrong.
         """
         for folder in folders_with(LISTS[0], source, f"{', '.join(LISTS)} in it nor folders with them"):
-            yield read_recording(folder).trajectory((Z_UP, BY_FORMAT))
+            yield read_recording(folder).trajectory(Z_UP)
 
 
 def read_recording(folder: Path) -> Capture:
@@ -76,7 +76,13 @@ def read_recording(folder: Path) -> Capture:
     poses = poses_at(color.times, truth, folder / LISTS[2])
     depths = _nearest(color.times, depth.times)
     frames = [
-        CapturedFrame(folder / words[0], folder / depth.words[number][0], pose, lens, seconds=float(time))
+        CapturedFrame(
+            color_file(folder / words[0]),
+            depth_file(folder / depth.words[number][0], PER_METRE),
+            pose,
+            lens,
+            seconds=float(time),
+        )
         for time, words, number, pose in zip(color.times, color.words, depths, poses, strict=True)
         if pose is not None and number >= 0
     ]
@@ -86,8 +92,7 @@ def read_recording(folder: Path) -> Capture:
         folder=folder,
         scene=folder.name,
         frames=frames,
-        units=UNITS,
-        files=[folder / name for name in LISTS] + [path for one in frames for path in (one.color, one.depth)],
+        files=[folder / name for name in LISTS] + [image.path for one in frames for image in (one.color, one.depth)],
         source={"format": "tum", "without_partners": len(color.words) - len(frames)},
     )
 

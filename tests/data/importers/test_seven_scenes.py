@@ -147,7 +147,7 @@ COLOR, DEPTH, POSE = (f"frame-000006.{part}" for part in ("color.png", "depth.pn
         (write(COLOR, "no image"), r"frame-000006\.color\.png: not a whole image"),
         (draw(COLOR, (10, 12, 3)), r"frame-000006\.color\.png: 10×12 pixels, the first colour image has 48×64"),
         (draw(DEPTH, (10, 12), np.uint16), r"frame-000006\.depth\.png: 10×12 pixels"),
-        (draw(DEPTH, (48, 64, 3)), r"frame-000006\.depth\.png: a depth image must have one integer channel"),
+        (draw(DEPTH, (48, 64, 3)), r"frame-000006\.depth\.png: must have one integer channel"),
         (save(POSE, np.diag([2.0, 2, 2, 1])), r"frame-000006\.pose\.txt: the pose is not rigid"),
         (save(POSE, np.full((4, 4), np.inf)), r"frame-000006\.pose\.txt: the pose is not finite"),
         (write(POSE, "lost tracking"), r"frame-000006\.pose\.txt: not a text file of numbers"),
