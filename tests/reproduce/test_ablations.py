@@ -7,7 +7,9 @@ import json
 from pathlib import Path
 
 import pytest
+import yaml
 
+import persist_recipes
 from persist_cli.checkpoints.save import write_card
 from persist_cli.errors import PersistError
 from persist_cli.recipe import make_recipe, read_recipe
@@ -36,6 +38,7 @@ from tests.support.command_lines import parse_line
 from tests.support.example_results import example_results
 
 OUT = Path("my runs/ablations")
+RECIPES = Path(persist_recipes.__file__).parent
 
 PLAN = Plan(
     out=OUT, samples=(1000, 5000), recipes=ablation_names(), base="reference", data=default_data(OUT),
@@ -65,15 +68,18 @@ def test_every_command_is_one_that_persist_takes(line):
 
 
 @pytest.mark.parametrize("name", ablation_names())
-def test_an_ablation_differs_from_the_papers_recipe_in_one_part_of_memory_or_adapter(name):
-    paper, changed = (make_recipe(read_recipe(recipe), recipe) for recipe in (PREFIX, name))
-    adapters = {key for key in paper.adapter | changed.adapter if paper.adapter.get(key) != changed.adapter.get(key)}
-    memories = dataclasses.replace(changed, memory=paper.memory, adapter=paper.adapter, description=paper.description)
-    assert memories == paper
-    changes = {PREFIX: 0, f"{PREFIX}-improved": 2, f"{PREFIX}-coded-rays": 2}
-    if changed.adapter["form"] != paper.adapter["form"]:  # each form has settings of its own
+def test_an_ablation_differs_from_the_one_that_it_extends_in_one_part_of_memory_or_adapter(name):
+    extended = PREFIX if name == PREFIX else yaml.safe_load((RECIPES / f"{name}.yaml").read_text())["extends"]
+    assert extended.startswith(PREFIX)
+    plain, changed = (make_recipe(read_recipe(recipe), recipe) for recipe in (extended, name))
+    adapters = {key for key in plain.adapter | changed.adapter if plain.adapter.get(key) != changed.adapter.get(key)}
+    memories = dataclasses.replace(changed, memory=plain.memory, adapter=plain.adapter, description=plain.description)
+    assert memories == plain
+    changes = {PREFIX: 0, f"{PREFIX}-improved": 2}
+    changes |= {f"{PREFIX}-canvas-cubes": 2, f"{PREFIX}-canvas-fine": 3}  # size and number follow the cells
+    if changed.adapter["form"] != plain.adapter["form"]:  # each form has settings of its own
         adapters = {"form", *adapters.intersection(("width", "ff_factor", "token_budget"))}
-    assert (changed.memory != paper.memory) + len(adapters) == changes.get(name, 1)
+    assert (changed.memory != plain.memory) + len(adapters) == changes.get(name, 1)
 
 
 def test_the_papers_recipe_has_what_the_paper_says():
