@@ -84,11 +84,6 @@ class Imaginer:
         """Whether the model is there."""
         return self._world is not None
 
-    @property
-    def busy(self) -> bool:
-        """Whether the model is being loaded, or imagines."""
-        return self._lock.locked()
-
     def find(self) -> Checkpoint:
         """Return the checkpoint, without loading it.
 

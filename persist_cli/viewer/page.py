@@ -31,6 +31,7 @@ MOST_TOKENS: Final = 4096
 FRAMES_A_SECOND: Final = 6.0
 NEARER: Final = 0.5  # metres that the view must have moved until large maps are drawn anew around it
 QUIET: Final = 0.5  # seconds at least between two of these drawings
+FAULT: Final = "a fault of persist; the terminal says more"
 COLORINGS: Final = {"own colour": "color", "origin": "origin", "class": "class"}
 
 
@@ -61,6 +62,7 @@ class Page:
         self._viewed_from, self._drawn_at = np.zeros(3), 0.0
         self._is_coarse, self._comes_near = False, False  # whether blocks stand for several cells; whether more come
         self._plays = False
+        self._ends = False
         self.edit_panel: EditPanel | None = None
         self.imagine_panel: ImaginePanel | None = None
         tabs = server.gui.add_tab_group()
@@ -86,11 +88,20 @@ class Page:
         def callback(event: Any) -> None:
             with self.lock:
                 try:
-                    work(event)
+                    if not self._ends:
+                        work(event)
                 except (PersistError, OSError) as error:
                     self.tell(error_line(error), event)
+                except BaseException:
+                    self.tell(FAULT, event)
+                    raise
 
         return callback
+
+    def end(self) -> None:
+        """Finish what is being done, and keep the lock, so that nothing changes any more."""
+        self._ends = True
+        self.lock.acquire()
 
     def newest(self, work: Callable[[Any], None]) -> Callable[[Any], None]:
         """Return a callback as ``guarded`` does, which works once for all events that wait for their turn.
@@ -113,10 +124,11 @@ class Page:
         return callback
 
     def tell(self, text: str, event: Any, title: str = "That did not work") -> None:
-        """Show a line in the tab where something happened, or in all tabs."""
-        clients = [event.client] if getattr(event, "client", None) is not None else self.server.get_clients().values()
-        for client in clients:
-            client.add_notification(title, text, auto_close_seconds=12.0)
+        """Show a line in the tab where something happened, if it is still open, or in all tabs."""
+        asked = getattr(event, "client", None)
+        for client in self.server.get_clients().values():
+            if asked is None or client is asked:
+                client.add_notification(title, text, auto_close_seconds=12.0)
 
     # the map
 

@@ -16,6 +16,7 @@ from persist_cli.io.own_address import EVERYWHERE, bind, leads_here, names_of, s
 
 REFUSED: Final = 1008  # code of WebSocket: a policy is violated
 MOST_BYTES: Final = 1 << 20  # of a message that a page sends
+CLOSE_SECONDS: Final = 1.0  # in which a page answers that its connection is closed, or is given up
 
 
 @contextlib.contextmanager
@@ -63,7 +64,7 @@ def _refuse_other_origins(server: viser.ViserServer, names: Collection[str], any
         connection = pages._live_connections.get(client.client_id)
         if connection is None or connection.request is None:
             return
-        connection.protocol.max_message_size = MOST_BYTES
+        connection.protocol.max_message_size, connection.close_timeout = MOST_BYTES, CLOSE_SECONDS
         asked = connection.request.headers.get("Host", "")
         is_own_page = same_host(connection.request.headers.get("Origin", ""), asked)
         if not (is_own_page and leads_here(asked, names, anywhere)):

@@ -114,12 +114,12 @@ def serve_page(plan: ViewPlan, subject: Subject, address: Address, as_json: bool
                 threading.Thread(target=open_browser, args=(url,), daemon=True).start()
             threading.Event().wait()
         except KeyboardInterrupt:
-            with page.lock:  # what is being done is finished first
-                pass
-    if session is not None:
-        say_unsaved(session)
-    if imaginer is not None and imaginer.busy:
-        leave()
+            try:
+                page.end()
+                if session is not None:
+                    say_unsaved(session)
+            finally:  # of a second Ctrl-C, too: threads wait for the page's lock, and a model may be loading
+                leave()
 
 
 def say_unsaved(session: EditSession) -> None:

@@ -86,9 +86,9 @@ def test_a_view_that_is_given_up_leaves_the_model_free(walks, voxel):
     assert imaginer.loaded
     views = imaginer.imagine(moved(file.poses()[0], 4.0), None)
     assert [next(views).arrived, next(views).arrived] == [False, False]
-    assert imaginer.busy
+    assert imaginer._lock.locked()
     views.close()
-    assert not imaginer.busy
+    assert not imaginer._lock.locked()
 
 
 def test_a_model_of_another_image_size_is_told_before_it_is_loaded(walks, voxel):
@@ -97,7 +97,7 @@ def test_a_model_of_another_image_size_is_told_before_it_is_loaded(walks, voxel)
     imaginer = Imaginer(ImagineSettings(voxel), file, None)
     with pytest.raises(PersistError, match="images are 64x64, the model takes 32x32"):
         imaginer.load(None)
-    assert not imaginer.busy
+    assert not imaginer._lock.locked()
 
 
 def test_the_model_without_an_adapter_cannot_read_a_memory(walks, voxel, own_map):

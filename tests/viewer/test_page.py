@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import threading
 import time
+import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +18,7 @@ from persist_cli.data.store import write_trajectory
 from persist_cli.memorize.memory_file import load_memory
 from persist_cli.viewer.edit_session import EditSession
 from persist_cli.viewer.imagine import Imaginer, ImagineSettings
-from persist_cli.viewer.page import Page
+from persist_cli.viewer.page import FAULT, Page
 from persist_cli.viewer.page_server import page_server
 from persist_cli.viewer.stage import Look
 from persist_cli.viewer.subject import MAP, POINTS, TRUTH, open_subject
@@ -96,6 +98,54 @@ def test_the_time_goes_on_until_nobody_looks(walks):
             tab.set(page.play, True)
             until(lambda: page.frame.value == 1)
         until(lambda: not page.play.value and not page._plays)
+
+
+def test_nothing_goes_on_when_the_page_has_ended(walks):
+    with page_server("127.0.0.1", 0) as server:
+        page = Page(server, open_subject(f"{walks}#0:0-3"), Look(layers={POINTS}), None, None)
+        with open_tab(server) as tab:
+            tab.set(page.play, True)
+            until(lambda: page.frame.value == 1)
+            page.end()
+            frame = page.frame.value
+            time.sleep(0.5)
+            later = page.frame.value
+            page.lock.release()
+        assert later == frame
+        until(lambda: not page._plays)
+
+
+def test_what_waits_for_its_turn_is_not_done_when_the_page_ends(server, room):
+    page = page_of(server, room, 40_000)
+    done = []
+    with page.lock:
+        waiting = threading.Thread(target=page.guarded(done.append), args=(None,))
+        waiting.start()
+        page.end()
+        page.lock.release()
+    waiting.join()
+    assert done == []
+
+
+def test_a_fault_is_told_on_the_page_and_the_page_goes_on(server, room):
+    page = page_of(server, room, 40_000)
+    told, done = [], []
+    page.tell = lambda text, event: told.append(text)
+    with pytest.raises(ZeroDivisionError):
+        page.guarded(lambda event: 1 / 0)(None)
+    page.guarded(done.append)(None)
+    assert (told, done) == ([FAULT], [None])
+
+
+def test_a_tab_that_is_closed_is_told_nothing(walks):
+    with page_server("127.0.0.1", 0) as server:
+        page = Page(server, open_subject(f"{walks}#0:0-3"), Look(layers={POINTS}), None, None)
+        with open_tab(server):
+            [client] = server.get_clients().values()
+        until(lambda: not server.get_clients())
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # viser warns of what it cannot deliver
+            page.tell("saved", SimpleNamespace(client=client))
 
 
 def test_what_lies_far_from_the_origin_is_drawn_to_a_millimetre(tmp_path):

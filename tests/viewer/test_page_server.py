@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import socket
 from collections.abc import Iterator
 
 import pytest
@@ -10,7 +11,7 @@ import viser
 from websockets.exceptions import ConnectionClosed
 
 from persist_cli.viewer.page_server import MOST_BYTES, REFUSED, page_server
-from tests.support.view_tabs import Tab, open_socket, open_tab, until
+from tests.support.view_tabs import PROTOCOL, Tab, open_socket, open_tab, until
 
 
 @pytest.fixture(scope="module")
@@ -75,6 +76,19 @@ def test_a_page_may_come_again_a_hundred_times(server):
         with open_socket(address(server)) as page:
             assert len(page.recv(timeout=20)) > 20
     until(lambda: not server._websock_server._live_connections)
+
+
+def test_a_page_that_sleeps_does_not_hold_up_the_end():
+    with page_server("127.0.0.1", 0) as server, socket.create_connection(("127.0.0.1", server.get_port())) as asleep:
+        asleep.sendall(
+            f"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nOrigin: http://127.0.0.1\r\nConnection: Upgrade\r\n"
+            f"Upgrade: websocket\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
+            f"Sec-WebSocket-Protocol: {PROTOCOL}\r\n\r\n".encode()
+        )
+        assert b"101" in asleep.recv(100)
+        until(lambda: bool(server._websock_server._live_connections))
+        server.stop()
+        assert not server._websock_server._server_thread.is_alive()
 
 
 def test_it_never_opens_a_tunnel_to_another_machine(server):
