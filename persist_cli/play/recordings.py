@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from persist_cli.errors import PersistError
+from persist_cli.io.files import folder_aside
 from persist_cli.output.console import warn
 from persist_cli.play.messages import Recorded
 from persist_cli.play.play import Play
@@ -86,19 +87,17 @@ class Shelf:
         """
         folder = self._recordings.folder / f"{time.strftime('walk-%Y%m%d-%H%M%S')}-{secrets.token_hex(2)}"
         try:
-            saved = play.save_recording(folder)
-            archive = Path(shutil.make_archive(str(folder / "walk"), "zip", saved.data))
-        except (PersistError, OSError) as error:
-            shutil.rmtree(folder, ignore_errors=True)
-            if isinstance(error, PersistError):
-                raise
+            with folder_aside(folder) as aside:
+                saved = play.save_recording(aside)
+                archive = Path(shutil.make_archive(str(aside / "walk"), "zip", saved.data))
+        except OSError as error:
             raise PersistError(
                 f"{folder}: {error.strerror}; make room there, and end the recording once more"
             ) from error
         play.end_recording()
         self._folders.append(folder)
-        video = self._publish(Download(saved.video, "walk.mp4", "video/mp4"))
-        trajectory = self._publish(Download(archive, "walk.zip", "application/zip"))
+        video = self._publish(Download(folder / saved.video.name, "walk.mp4", "video/mp4"))
+        trajectory = self._publish(Download(folder / archive.name, "walk.zip", "application/zip"))
         stays = str(folder) if self._recordings.stays else None
         return Recorded(frames=saved.frames, video=video, trajectory=trajectory, folder=stays)
 

@@ -8,6 +8,7 @@ import pytest
 
 from persist_cli.data.store import Store
 from persist_cli.errors import PersistError
+from persist_cli.io.files import ASIDE
 from persist_cli.play import recording
 from persist_cli.play.recordings import ADDRESS, Recordings
 from persist_cli.play.worker import Workers
@@ -48,6 +49,21 @@ def test_a_walk_that_ends_while_it_is_recorded_is_saved_in_the_folder(play, tmp_
     recordings.close()
     [folder] = tmp_path.iterdir()
     assert len(Store(folder / "data")[0].read()) == 3
+
+
+def test_a_recording_is_in_the_folder_whole_or_not_at_all(play, tmp_path, monkeypatch):
+    archive, present = shutil.make_archive, []
+
+    def look(*arguments):
+        present.extend(path.name for path in tmp_path.iterdir())
+        return archive(*arguments)
+
+    monkeypatch.setattr(shutil, "make_archive", look)
+    recorded = Recordings(tmp_path).shelf().save(play)
+    assert [name.startswith(ASIDE) for name in present] == [True]
+    [folder] = tmp_path.iterdir()
+    assert str(folder) == recorded.folder
+    assert sorted(path.name for path in folder.iterdir()) == ["data", "walk.mp4", "walk.zip"]
 
 
 def test_a_full_recording_is_saved_when_its_walk_ends(play, tmp_path, monkeypatch):
