@@ -284,9 +284,15 @@ def test_a_lost_connection_comes_back_by_itself(browser: Browser, walks: Scripte
     with opened(browser, walks) as page:
         page.keyboard.down("w")
         wait_for_frame(page, 2)
+        walks.tell(Error(text="no way there"))
+        walks.tell(Error(text="the server was stopped", ended=True))
+        walks.welcoming.clear()
         walks.sockets[-1].close(1001)
         page.wait_for_selector("#state:text('Connection lost')")
+        assert page.locator("#lines p span").all_inner_texts() == ["no way there", "the server was stopped"]
+        walks.welcoming.set()
         page.wait_for_selector("#state:text('Ready')")
+        assert page.locator("#lines p span").all_inner_texts() == ["no way there"]
         assert len(walks.sockets) == 2
 
 

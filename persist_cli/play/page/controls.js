@@ -31,6 +31,7 @@ class Controls {
   }
 
   begin({ limits, actions, settings }) {
+    for (const line of document.querySelectorAll("#lines .ended")) line.remove(); // why the session before has ended
     const taken = new Set(actions.flatMap(({ keys }) => keys));
     this.keys = Object.fromEntries(COMMANDS.filter(([, , key]) => key && !taken.has(key)).map(([name, , key]) => [key, name]));
     byId("commands").replaceChildren(...COMMANDS.map(command => this.button(...command)));

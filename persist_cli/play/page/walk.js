@@ -51,7 +51,7 @@ const connection = new Connection({
     tell();
   },
   notice: ({ text }) => controls.say(text, "notice"),
-  error: ({ text }) => controls.say(text, "error"),
+  error: ({ text, ended }) => controls.say(text, ended ? "error ended" : "error"),
   recorded: message => controls.recorded(message),
   lost(wait, taken) {
     gone();
