@@ -330,7 +330,7 @@ def test_a_session_that_failed_is_begun_again_by_hand(browser: Browser, walks: S
 def test_the_page_fits_its_window(browser: Browser, walks: ScriptedWalks, width: int, scheme: str) -> None:
     with opened(browser, walks, color_scheme=scheme) as page:
         page.set_viewport_size({"width": width, "height": 800})
-        page.evaluate(TWO_PICTURES)  # the views take their new size
+        page.wait_for_function(TWO_PICTURES)  # the views take their new size; evaluate would wait for ever
         assert page.evaluate("document.documentElement.scrollWidth") == width
         panes = [box for box in (pane.bounding_box() for pane in page.locator("#panes canvas").all()) if box]
         assert all(box["x"] >= 0 and box["x"] + box["width"] <= width and box["width"] >= 96 for box in panes)

@@ -24,6 +24,14 @@ from persist_cli.play.walking_page import walking_page
 PATIENCE = 60.0  # seconds in which a busy machine answers
 
 
+def until(happened: Callable[[], bool]) -> None:
+    """Wait until something is so."""
+    end = time.monotonic() + PATIENCE
+    while not happened():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
 def unpack(message: bytes) -> tuple[dict[str, Any], list[bytes]]:
     """Return the header and the images of a binary message, as the page reads them."""
     (length,) = LENGTH.unpack_from(message)
@@ -62,9 +70,10 @@ class Page:
         return header, images
 
     def until(self, kind: str) -> tuple[dict[str, Any], list[bytes]]:
-        """The next message of a type."""
+        """The next message of a type, however many others come before it for a while."""
+        end = time.monotonic() + PATIENCE
         while (message := self.next())[0]["type"] != kind:
-            pass
+            assert time.monotonic() < end, f"no {kind}"
         return message
 
     def frames(self, count: int) -> list[dict[str, Any]]:
@@ -94,9 +103,7 @@ class Served:
 
     def settle(self) -> None:
         """Wait until no session is open, and the worker has done what it was given."""
-        deadline = time.monotonic() + PATIENCE
-        while self.sessions.open and time.monotonic() < deadline:
-            time.sleep(0.01)
+        until(lambda: not self.sessions.open)
         done = Future[None]()
         self.sessions.workers.give_last(lambda: done.set_result(None))
         done.result(PATIENCE)
@@ -114,7 +121,7 @@ def serving(walk: Callable[[], Play], limits: Limits | None = None) -> Iterator[
     recordings, started, bound = Recordings(), threading.Event(), bind("127.0.0.1", 0)
     sessions = Sessions(walk, limits or Limits(frames_per_second=120), recordings)
     server = Server(make_app(walking_page(), sessions), sessions, started.set)
-    thread = threading.Thread(target=server.serve_on, args=(bound,))
+    thread = threading.Thread(target=server.serve_on, args=(bound,), daemon=True)  # one that hangs ends with the tests
     thread.start()
     assert started.wait(PATIENCE)
     try:

@@ -138,7 +138,9 @@ def serving(walks: ScriptedWalks, port: int = 0) -> Iterator[str]:
     with serve(walks.walk, "127.0.0.1", port, process_request=walks.page, compression=None) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         host, number = server.socket.getsockname()[:2]
-        yield f"http://{host}:{number}/"
-        for socket in walks.sockets:
-            socket.close()
-        server.shutdown()
+        try:
+            yield f"http://{host}:{number}/"
+        finally:  # its threads would keep the tests from ending
+            for socket in walks.sockets:
+                socket.close()
+            server.shutdown()

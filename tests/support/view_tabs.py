@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import socket
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -15,17 +14,10 @@ import viser
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
-PATIENCE = 60.0  # seconds in which a busy machine answers
+from tests.support.play_pages import PATIENCE, until
+
 PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
 ALL_READ: dict[str, Any] = {"max_size": None, "max_queue": None}  # else 16 unread messages hold up its pongs: it closes
-
-
-def until(happened: Callable[[], bool]) -> None:
-    """Wait until something is so."""
-    end = time.monotonic() + PATIENCE
-    while not happened():
-        assert time.monotonic() < end
-        time.sleep(0.05)
 
 
 def open_socket(address: str, origin: str | None = "", host: str = "") -> ClientConnection:

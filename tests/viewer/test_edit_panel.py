@@ -18,7 +18,8 @@ from persist_cli.viewer.page_server import page_server
 from persist_cli.viewer.stage import Look
 from persist_cli.viewer.subject import MAP, open_subject
 from tests.support.disk import file_limit
-from tests.support.view_tabs import Tab, open_tab, until
+from tests.support.play_pages import until
+from tests.support.view_tabs import Tab, open_tab
 
 
 @pytest.fixture(scope="module")

@@ -22,8 +22,9 @@ from persist_cli.viewer.page import FAULT, Page
 from persist_cli.viewer.page_server import page_server
 from persist_cli.viewer.stage import Look
 from persist_cli.viewer.subject import MAP, POINTS, TRUTH, open_subject
+from tests.support.play_pages import until
 from tests.support.rooms import Room, walk
-from tests.support.view_tabs import open_tab, until
+from tests.support.view_tabs import open_tab
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,8 @@ import viser
 from websockets.exceptions import ConnectionClosed
 
 from persist_cli.viewer.page_server import MOST_BYTES, REFUSED, page_server
-from tests.support.view_tabs import PROTOCOL, Tab, open_socket, open_tab, until
+from tests.support.play_pages import until
+from tests.support.view_tabs import PROTOCOL, Tab, open_socket, open_tab
 
 
 @pytest.fixture(scope="module")
