@@ -5,11 +5,15 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections.abc import Collection, Iterator
+from functools import partial
 from typing import Any, Final
 
 import rich
 import viser
+import websockets.asyncio.server
+from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
 
 from persist_cli.errors import PersistError
 from persist_cli.io.own_address import EVERYWHERE, bind, leads_here, names_of, same_host
@@ -37,7 +41,8 @@ def page_server(host: str, port: int) -> Iterator[viser.ViserServer]:
     log, one_line = logging.getLogger("websockets.server"), _OneLine()
     log.addFilter(one_line)
     try:
-        server = viser.ViserServer(host=host, port=port, label="persist view", verbose=False)
+        with _out_of_frames():
+            server = viser.ViserServer(host=host, port=port, label="persist view", verbose=False)
         try:
             if port and server.get_port() != port:  # taken in between, and viser went on to the next one
                 raise PersistError(f"cannot serve at {host}:{port}: taken; give another --port, or --port 0")
@@ -51,6 +56,25 @@ def page_server(host: str, port: int) -> Iterator[viser.ViserServer]:
     finally:
         console.quiet = quiet
         log.removeFilter(one_line)
+
+
+@contextlib.contextmanager
+def _out_of_frames() -> Iterator[None]:
+    """Let no other page show, in a frame where it leads clicks, that of a server which starts within the block.
+
+    viser has no setting for this, so that the server which it starts is given one.
+    """
+    module: Any = websockets.asyncio.server
+    serve = module.serve
+    module.serve = partial(serve, process_response=_forbid_frames)
+    try:
+        yield
+    finally:
+        module.serve = serve
+
+
+def _forbid_frames(connection: ServerConnection, request: Request, response: Response) -> None:
+    response.headers["X-Frame-Options"] = "DENY"
 
 
 def _refuse_other_origins(server: viser.ViserServer, names: Collection[str], anywhere: bool) -> None:

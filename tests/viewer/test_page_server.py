@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import socket
+import urllib.request
 from collections.abc import Iterator
 
 import pytest
@@ -39,6 +40,11 @@ def received(server: viser.ViserServer, origin: str | None, host: str = "") -> b
 
 def test_the_own_page_is_served(server):
     assert len(received(server, "")) > 20
+
+
+def test_no_other_page_shows_it_in_a_frame(server):
+    with urllib.request.urlopen(address(server)) as answer:
+        assert answer.headers["X-Frame-Options"] == "DENY"
 
 
 @pytest.mark.parametrize("origin", ["http://elsewhere.example", "http://127.0.0.1:1", "null", None])
