@@ -35,14 +35,14 @@ def page_server(host: str, port: int) -> Iterator[viser.ViserServer]:
         PersistError: when the address cannot be used or the port is taken.
     """
     with bind(host, port) as bound:  # and freed: viser itself would take the next free port, or wait for ever
-        names = names_of(host, bound)
+        names, number = names_of(host, bound), bound.getsockname()[0]  # of several addresses of a name the one tried
     console = rich.get_console()
     quiet, console.quiet = console.quiet, True  # viser prints on it
     log, one_line = logging.getLogger("websockets.server"), _OneLine()
     log.addFilter(one_line)
     try:
         with _out_of_frames():
-            server = viser.ViserServer(host=host, port=port, label="persist view", verbose=False)
+            server = viser.ViserServer(host=number, port=port, label="persist view", verbose=False)
         try:
             if port and server.get_port() != port:  # taken in between, and viser went on to the next one
                 raise PersistError(f"cannot serve at {host}:{port}: taken; give another --port, or --port 0")

@@ -98,5 +98,17 @@ def test_a_page_that_sleeps_does_not_hold_up_the_end():
         assert not server._websock_server._server_thread.is_alive()
 
 
+def test_a_name_with_an_address_that_is_not_here_is_served_at_the_one_that_is(monkeypatch):
+    found = socket.getaddrinfo
+
+    def two(host, *arguments, **options):
+        names = ("127.0.0.1", "192.0.2.1") if host == "localhost" else (host,)  # as ::1 where there is no IPv6
+        return [address for name in names for address in found(name, *arguments, **options)]
+
+    monkeypatch.setattr(socket, "getaddrinfo", two)
+    with page_server("localhost", 0) as server, open_socket(address(server)) as page:
+        assert len(page.recv(timeout=20)) > 20
+
+
 def test_it_never_opens_a_tunnel_to_another_machine(server):
     assert server.request_share_url() is None
