@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import psutil
 
+from persist_cli.errors import PersistError
 from persist_cli.output.console import print_table, say
 from persist_cli.reproduce.pages import CHROMIUM, ServedPage, driven_chromium, served_page, split_arguments
 from persist_cli.reproduce.play_picture import READY, frame_number
@@ -96,7 +97,11 @@ def measure(page: Page, server: psutil.Process, presses: int, hold: int) -> Answ
 
 
 def press(page: Page, key: str, hold: int) -> float | None:
-    """Hold a key until some frames are drawn, and return how many a second; ``None`` where the way ends before."""
+    """Hold a key until some frames are drawn, and return how many a second; ``None`` where the way ends before.
+
+    Raises:
+        PersistError: when no frame is drawn.
+    """
     page.evaluate("() => { drawn.length = 0; }")
     page.keyboard.down(key)
     waited = 0
@@ -106,15 +111,24 @@ def press(page: Page, key: str, hold: int) -> float | None:
         page.wait_for_timeout(LOOK)
         waited += LOOK
     page.keyboard.up(key)
+    if not drawn:
+        raise PersistError(f"the page has drawn no frame in {STUCK:g} s; it says: {page.inner_text('#state')}")
     times = page.evaluate(f"drawn.slice(0, {hold})")
     return 1000 * (hold - 1) / (times[-1] - times[0]) if len(times) == hold else None
 
 
 def wait_until_still(page: Page) -> None:
-    """Wait until no more frames come."""
+    """Wait until no more frames come.
+
+    Raises:
+        PersistError: when they do not end.
+    """
     last = -1
-    while last != (last := frame_number(page)):
+    for _ in range(round(1000 * STUCK / STILL)):
+        if last == (last := frame_number(page)):
+            return
         page.wait_for_timeout(STILL)
+    raise PersistError(f"the page draws frames although no key is held; it says: {page.inner_text('#state')}")
 
 
 def walk(page: Page, frames: int, hold: int = 40) -> None:
