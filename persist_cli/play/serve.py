@@ -22,6 +22,7 @@ from persist_cli.play.recordings import Recordings
 from persist_cli.play.server import Server, make_app
 from persist_cli.play.sessions import Limits, Sessions
 from persist_cli.play.walking_page import walking_page
+from persist_cli.play.worker import Workers
 
 LAST_CALL_SECONDS: Final = 1.0  # that a call to the model may still take when the server has ended
 SAVING_SECONDS: Final = 120.0  # the same, where a recording is saved; a full one takes a minute or more
@@ -65,7 +66,7 @@ def run_play(options: PlayOptions, serving: ServeOptions) -> None:
             server = Server(app, sessions, lambda: announce(bound, serving))
             signals.end(server)
             server.serve_on(bound)
-            done = sessions.workers.close(LAST_CALL_SECONDS if serving.recordings is None else SAVING_SECONDS)
+            done = end_workers(sessions.workers, saves=serving.recordings is not None)
         except KeyboardInterrupt:  # before there was a server
             return
         finally:
@@ -73,6 +74,20 @@ def run_play(options: PlayOptions, serving: ServeOptions) -> None:
             recordings.close()
         if not done:
             leave()
+
+
+def end_workers(workers: Workers, saves: bool) -> bool:
+    """Let workers end, and return whether they have; where they save they get longer, and it is told.
+
+    Args:
+        workers: have nothing to do but what they were given.
+        saves: whether they may save recordings that stay.
+    """
+    done = workers.close(LAST_CALL_SECONDS)
+    if saves and not done:
+        warn("what was recorded is saved before this ends, which can take a minute")
+        done = workers.close(SAVING_SECONDS)
+    return done
 
 
 def first_ready(walk: Callable[[], Play]) -> Callable[[], Play]:

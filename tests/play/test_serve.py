@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 import signal
 import socket
+import threading
 
 import pytest
 from websockets.exceptions import ConnectionClosed
 
 from persist_cli.data.store import Store
 from persist_cli.io.own_address import address_of, bind, names_of
+from persist_cli.play import serve
+from persist_cli.play.worker import Workers
 from tests.support.play_pages import open_page
 from tests.support.processes import start_persist, wait_until
 
@@ -33,6 +36,18 @@ def test_ctrl_c_ends_the_command_without_an_error_while_somebody_walks(voxel, wa
     assert process.wait() == 0
     assert "Traceback" not in printed.read_text()
     assert len(Store(next(out.iterdir()) / "data")[0].read()) > 2
+
+
+def test_a_recording_that_is_still_saved_is_waited_for_and_the_terminal_says_so(monkeypatch, capsys):
+    monkeypatch.setattr(serve, "LAST_CALL_SECONDS", 0.1)
+    workers, may_end, saved = Workers(), threading.Event(), []
+    workers.give_last(lambda: saved.append(may_end.wait(60)))
+    assert not serve.end_workers(workers, saves=False)
+    assert capsys.readouterr().err == ""
+    threading.Timer(0.5, may_end.set).start()
+    assert serve.end_workers(workers, saves=True)
+    assert saved == [True]
+    assert capsys.readouterr().err.startswith("what was recorded is saved before this ends")
 
 
 def test_what_cannot_be_opened_is_said_before_a_page_is_served(persist, voxel, walks):
