@@ -56,9 +56,6 @@ KINDS: Final = {
 OWN: Final = ("persist_cli", "persist_backbones", "persist_memory")  # packages whose errors are bugs of ours
 
 
-_NAMES: Final[dict[type, str]] = {}  # those of the classes that are loaded
-
-
 @dataclass(frozen=True)
 class Plugin:
     """A plugin before it is imported.
@@ -88,6 +85,9 @@ class Plugin:
 
     def __str__(self) -> str:
         return f"{self.kind} {self.name!r} ({self.package} {self.version}, {self.target})"
+
+
+_LOADED: Final[dict[type, Plugin]] = {}  # by their classes
 
 
 def list_plugins(kind: str) -> list[Plugin]:
@@ -152,8 +152,9 @@ def import_plugin(plugin: Plugin) -> type[Any]:
     cause = _flaw(loaded, base, KINDS[plugin.kind])
     if cause:
         raise plugin.error(f"is broken: {cause}", cause)
-    if _NAMES.setdefault(loaded, plugin.name) != plugin.name:
-        cause = f"its class is that of {_NAMES[loaded]!r} too; each name needs one of its own"
+    other = _LOADED.setdefault(loaded, plugin).name
+    if other != plugin.name:
+        cause = f"its class is that of {other!r} too; each name needs one of its own"
         raise plugin.error(f"is broken: {cause}", cause)
     loaded.name = plugin.name
     return loaded  # type: ignore[no-any-return]
@@ -213,21 +214,33 @@ def plugin_errors() -> Iterator[None]:
 
 
 def _blame(error: BaseException) -> PluginError | None:
-    """The error of the plugin that an exception passed through, ``None`` when it passed through none."""
-    plugins = {plugin.module: plugin for kind in KINDS for plugin in list_plugins(kind) if plugin.module not in OWN}
-    inside = [(frame, line) for frame, line in _frames(error.__traceback__) if _package_of(frame) in plugins]
+    """The error of the innermost plugin that an exception passed through, ``None`` when it passed through none."""
+    plugins = [plugin for kind in KINDS for plugin in list_plugins(kind) if plugin.module not in OWN]
+    modules = {plugin.module for plugin in plugins}
+    inside = [(frame, line) for frame, line in _frames(error.__traceback__) if _package_of(frame) in modules]
     if not inside:
         return None
-    (entered, _), (innermost, line) = inside[0], inside[-1]
-    of_package = [plugin for kind in KINDS for plugin in list_plugins(kind) if plugin.module == _package_of(entered)]
+    owners = [_owner(frame) for frame, _ in inside]
+    owner = next(filter(None, reversed(owners)), None)
+    callers = [index for index, other in enumerate(owners) if other not in (None, owner)]
+    entered = inside[owners.index(owner, callers[-1] + 1 if callers else 0)][0]
+    innermost, line = inside[-1]
     method = entered.f_code.co_qualname
-    named = [plugin for plugin in of_package if method.startswith(f"{plugin.target.partition(':')[2]}.")]
-    plugin = (named or of_package)[0]
+    if callers:
+        method += f", called in {inside[callers[-1]][0].f_code.co_qualname}"
     cause = f"{first_line(error)} ({innermost.f_code.co_filename}:{line})"
     failed = f"failed in {method}: {cause}; set {TRACEBACK}=1 for the whole traceback"
-    if named or len(of_package) == 1:
-        return plugin.error(failed, cause)
-    return PluginError(f"package {plugin.package} {plugin.version} {failed}", plugin.package, cause=cause)
+    of_package = [plugin for plugin in plugins if plugin.module == _package_of(entered)]
+    if owner or len(of_package) == 1:
+        return (owner or of_package[0]).error(failed, cause)
+    package = of_package[0]
+    return PluginError(f"package {package.package} {package.version} {failed}", package.package, cause=cause)
+
+
+def _owner(frame: FrameType) -> Plugin | None:
+    """The plugin whose method a frame runs, also where its class inherits the method; ``None`` for other code."""
+    first = frame.f_locals.get(frame.f_code.co_varnames[0]) if frame.f_code.co_argcount else None
+    return _LOADED.get(first if isinstance(first, type) else type(first))
 
 
 def _frames(place: TracebackType | None) -> Iterator[tuple[FrameType, int]]:

@@ -233,6 +233,32 @@ def test_an_exception_in_a_plugin_is_one_line_that_says_where(persist, site, wal
     assert "Traceback" in persist(*arguments).err
 
 
+ENCODER = """
+    from persist_cli.api.encoder import Encoder
+    class Failing(Encoder):
+        channels = 3
+        def encode(self, rgb): return rgb.gray()
+"""
+
+
+def test_an_encoder_that_fails_within_a_memory_of_another_package_is_named_itself(persist, site, walks):
+    install(site, "persist-last", "persist.memories", "last = calling_frame:LastFrame", LAST_FRAME)
+    install(site, "persist-gray", "persist.encoders", "gray = failing_encoder:Failing", ENCODER)
+    ended = persist(
+        "memorize", f"{walks}#0:0-3", "--memory", "last", "--encoder", "gray", "--out", site / "m.safetensors"
+    )
+    line = "error: encoder 'gray' (persist-gray 1.2, failing_encoder:Failing) failed in Failing.encode, called in "
+    assert (ended.code, ended.err.startswith(f"{line}LastFrame.write: AttributeError")) == (1, True)
+
+
+def test_a_plugin_that_inherits_its_method_from_another_one_is_named_itself(persist, site, walks):
+    install(site, "persist-last", "persist.memories", "last = parent_frame:LastFrame", LAST_FRAME)
+    child = "import parent_frame\nclass Child(parent_frame.LastFrame):\n    def __init__(self, *parts): pass\n"
+    install(site, "persist-child", "persist.memories", "child = child_frame:Child", child)
+    ended = persist("memorize", f"{walks}#0:0-3", "--memory", "child", "--out", site / "m.safetensors")
+    assert "memory 'child' (persist-child 1.2, child_frame:Child) failed in LastFrame.write: AttributeErr" in ended.err
+
+
 def test_an_error_of_several_lines_is_printed_in_one(persist, site, walks):
     writing = "self.frame = self.encoder.encode(observations.rgb[-1:])[0].flatten(0, 1)"
     told = "from persist_cli.errors import DataError; raise DataError('no\\nframe')"
