@@ -44,12 +44,13 @@ class Encoder(ABC):
         """Return float32 features on a grid that covers the image evenly, on the encoder's device."""
 
     def encoded(self, rgb: UInt8[Tensor, "frame height width 3"]) -> Float[Tensor, "frame rows columns channel"]:
-        """Return what ``encode`` does, after a check that it is what that promises. Memories encode by this method.
+        """Return what ``encode`` does, without gradients and checked. Memories encode by this method.
 
         Raises:
-            PluginError: when it is not.
+            PluginError: when it is not what that promises.
         """
-        features = self.encode(rgb)
+        with torch.no_grad():
+            features = self.encode(rgb)
         check_features(features, self.name, self.channels, len(rgb))
         return features
 

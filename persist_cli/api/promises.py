@@ -61,6 +61,8 @@ def _wrong_part(tokens: MemoryTokens) -> str:
         if name in parts and not _is_of(parts[name], dtype, (None, *shape)):
             wanted = f"{str(dtype).removeprefix('torch.')} {_shape(('token', *shape))}"
             return f"{name} as {_kind(parts[name])}, not {wanted}"
+        if name in parts and parts[name].requires_grad:
+            return f"{name} with a gradient; compute them under torch.no_grad()"
     lengths = {name: len(parts[name]) for name in TOKEN_PARTS if name in parts}
     if len(set(lengths.values())) > 1:
         return f"tokens of several lengths: {', '.join(f'{length} {name}' for name, length in lengths.items())}"
@@ -205,7 +207,8 @@ def check_losses(losses: Any, model: str) -> None:
 
 def is_finite(values: Tensor) -> bool:
     """Whether all of many numbers are finite; those without content are. A sum tells it soonest."""
-    return values.is_meta or math.isfinite(float(values.sum()))
+    wide = torch.promote_types(values.dtype, torch.float32)  # a sum in half precision ends at 65504
+    return values.is_meta or math.isfinite(float(values.sum(dtype=wide)))
 
 
 def _is_of(value: Any, dtype: torch.dtype, shape: tuple[int | None, ...]) -> bool:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from persist_cli.api.encoder import Encoder
 from persist_cli.api.promises import (
     check_costs,
     check_counts,
@@ -20,6 +21,7 @@ from persist_cli.api.promises import (
 )
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import PluginError
+from persist_cli.io.settings import NoSettings
 
 TOKENS = MemoryTokens.of(torch.ones(5, 32), torch.ones(5, 3), torch.zeros(5, 3, dtype=torch.uint8))
 LOSS = torch.ones(3, requires_grad=True)
@@ -44,6 +46,7 @@ def changed(**parts: object) -> MemoryTokens:
         (changed(origins=torch.full((5,), 7, dtype=torch.uint8)), "origins beyond 2"),
         (changed(features=torch.full((5, 32), torch.nan)), "not finite"),
         (changed(positions=torch.full((5, 3), torch.inf).double()), "not finite"),
+        (changed(features=torch.ones(5, 32, requires_grad=True)), "features with a gradient; compute them under"),
         (changed(features=torch.ones(5, 31)), "31 features, where its encoder has 32"),
         (MemoryTokens.of(torch.ones(9, 32), torch.ones(9, 3)), "9 tokens of at most 8"),
     ],
@@ -76,6 +79,21 @@ def test_tokens_as_promised_pass(tokens):
 def test_features_that_no_encoder_promises_name_the_encoder(features, channels, cause):
     with pytest.raises(PluginError, match=f"^encoder 'mine': .*{cause}"):
         check_features(features, "mine", channels, 2)
+
+
+def test_features_in_half_precision_are_finite_however_many_there_are():
+    check_features(torch.full((1, 64, 64, 32), 8.0, dtype=torch.float16), "fine", 32, 1)
+
+
+def test_features_of_an_encoder_with_weights_have_no_gradient():
+    class Learned(Encoder):
+        channels = 4
+        weight = torch.nn.Parameter(torch.ones(3, 4))
+
+        def encode(self, rgb):
+            return rgb.float() @ self.weight
+
+    assert not Learned(NoSettings()).encoded(torch.zeros(1, 2, 2, 3, dtype=torch.uint8)).requires_grad
 
 
 @pytest.mark.parametrize(
