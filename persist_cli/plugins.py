@@ -12,7 +12,7 @@ import importlib
 import inspect
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
@@ -173,6 +173,32 @@ def _flaw(loaded: Any, base: type, kind: PluginKind) -> str:
         inspect.signature(loaded).bind(*kind.arguments)
     except TypeError:
         return f"its __init__ does not take ({', '.join(kind.arguments)})"
+    return next(filter(None, (_wrong_member(loaded, base, name) for name in vars(base) if name[0] != "_")), "")
+
+
+def _wrong_member(loaded: type, base: type, name: str) -> str:
+    """Why what a class has in place of a method or value of its base cannot stand for it, empty when it can."""
+    own, given = inspect.getattr_static(base, name), inspect.getattr_static(loaded, name)
+    if given is own or (hasattr(given, "__get__") and not callable(given)):  # a property, or a class method
+        return ""
+    if isinstance(own, property):
+        return f"its {name} is a method; write @property above it" if inspect.isfunction(given) else ""
+    if isinstance(own, bool | int | str | frozenset):
+        kind = Set if isinstance(own, frozenset) else type(own)
+        return "" if isinstance(given, kind) else f"its {name} is {given!r}, no {type(own).__name__}"
+    if not inspect.isfunction(own):
+        return ""
+    wanted = list(inspect.signature(own).parameters.values())
+    passed = wanted[1:] if isinstance(given, staticmethod) else wanted
+    try:
+        inspect.signature(getattr(loaded, name)).bind(
+            *(part.name for part in passed if part.kind is part.POSITIONAL_OR_KEYWORD),
+            **{part.name: part for part in passed if part.kind is part.KEYWORD_ONLY},
+        )
+    except TypeError:
+        return f"its {name} does not take ({', '.join(part.name for part in wanted[1:])})"
+    except ValueError:  # a function of a compiled module may not say what it takes
+        return ""
     return ""
 
 

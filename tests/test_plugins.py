@@ -184,6 +184,24 @@ UNFINISHED = """
         def encode(self, rgb): pass
 
     def function(settings, encoder, reference): pass
+
+    class Short(Alone):
+        def __init__(self, *parts): pass
+        def read(self, cameras): pass
+
+    class Optional(Short):
+        def read(self, cameras, budget, more=0): pass
+        def edit(self, *edits): pass
+        @staticmethod
+        def resolution(cameras, distance=1.0): pass
+        reads_depth = property(lambda self: False)
+
+    class Hidden(Optional):
+        reads_depth = "no"
+
+    class Method(Unset):
+        settings_type = Memory.settings_type
+        def channels(self): return 3
 """
 
 
@@ -192,6 +210,9 @@ UNFINISHED = """
     [("memory", "Unfinished", "it lacks restore, write, which Memory leaves to its subclasses"),
      ("memory", "Alone", "its __init__ does not take (settings, encoder, reference)"),
      ("encoder", "Unset", "its settings_type is no dataclass"),
+     ("memory", "Short", "its read does not take (cameras, budget)"),
+     ("memory", "Hidden", "its reads_depth is 'no', no bool"),
+     ("encoder", "Method", "its channels is a method; write @property above it"),
      ("memory", "function", "it is no subclass of persist_cli.api.memory.Memory"),
      ("memory", "Absent", "AttributeError: module 'unfinished' has no attribute 'Absent'")],
 )  # fmt: skip
@@ -206,6 +227,11 @@ def test_an_unfinished_plugin_is_shown_as_broken_and_refused_in_one_line(persist
     with pytest.raises(PluginError) as error:
         load_plugin(kind, "unfinished")
     assert (error.value.package, error.value.cause) == ("persist-unfinished", cause)
+
+
+def test_a_method_that_takes_more_than_it_is_given_can_be_used(site):
+    install(site, "persist-unfinished", "persist.memories", "unfinished = unfinished:Optional", UNFINISHED)
+    assert load_plugin("memory", "unfinished").name == "unfinished"
 
 
 @pytest.mark.parametrize("target", ["unfinished", "unfinished:"])
