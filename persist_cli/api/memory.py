@@ -18,7 +18,7 @@ from persist_cli.api.cameras import Cameras
 from persist_cli.api.encoder import Encoder
 from persist_cli.api.memory_file import FORMAT, FORMAT_VERSION
 from persist_cli.api.observations import Observations, Origin, origins_like
-from persist_cli.api.promises import check_counts, check_points, check_stored, check_tokens
+from persist_cli.api.promises import check_figures, check_points, check_stored, check_tokens
 from persist_cli.api.scene_edits import Edit, EditOutcome
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError, PersistError, PluginError
@@ -256,8 +256,13 @@ class Memory(ABC):
         return None
 
     def header(self) -> dict[str, Any]:
-        """Return the JSON values that a memory file holds beside its tensors: kind, settings, encoder, reference."""
+        """Return the JSON values that a memory file holds beside its tensors: kind, settings, encoder, reference.
+
+        Raises:
+            PluginError: when the memory's figures are no numbers of items.
+        """
         figures = self.figures()
+        check_figures(figures, self.name)
         return {
             "format": FORMAT,
             "version": FORMAT_VERSION,
@@ -283,9 +288,8 @@ class Memory(ABC):
             OSError: when it cannot be written.
             PluginError: when what the memory gives can be no memory file.
         """
-        tensors, points, header = self.tensors(), self.points(), self.header()
+        tensors = self.tensors()
         check_stored(tensors, self.name, PATH)
-        check_points(points.positions, points.colors, self.name)
-        check_counts(header["cells"], header["imagined"], self.name)
+        check_points(self.points(), self.name)
         poses = {PATH + name: poses.contiguous() for name, poses in (paths or {}).items()}
-        write_tensors(path, dict(tensors) | poses, {"persist": json.dumps(header)})
+        write_tensors(path, dict(tensors) | poses, {"persist": json.dumps(self.header())})

@@ -90,24 +90,37 @@ def check_stored(tensors: Any, memory: str, reserved: str) -> None:
             raise _broken("memory", memory, f"tensors gave {name} as {_kind(tensor)}, not a tensor of items")
 
 
-def check_points(positions: Any, colors: Any, memory: str) -> None:
+def check_points(points: Any, memory: str) -> None:
     """Raise ``PluginError`` when the points of a memory cannot be drawn.
 
     Args:
-        positions: those of ``Memory.points``, metres.
-        colors: their colours.
+        points: what ``Memory.points`` returned.
         memory: the memory's name.
     """
+    parts = [getattr(points, part, None) for part in ("positions", "colors", "origins")]
+    if any(part is None for part in parts):
+        raise _broken("memory", memory, f"points gave {_kind(points)}, not MapPoints")
+    positions, colors, origins = parts
     if not (isinstance(positions, Tensor) and positions.is_floating_point() and positions.shape[1:] == (3,)):
         raise _broken("memory", memory, f"points gave positions as {_kind(positions)}, not float [point, 3]")
     if not _is_of(colors, torch.uint8, (len(positions), 3)):
         raise _broken("memory", memory, f"points gave colours as {_kind(colors)}, not uint8 [{len(positions)}, 3]")
+    if not _is_of(origins, torch.uint8, (len(positions),)):
+        raise _broken("memory", memory, f"points gave origins as {_kind(origins)}, not uint8 [{len(positions)}]")
     if not is_finite(positions):
         raise _broken("memory", memory, "points gave positions that are not finite")
 
 
-def check_counts(cells: Any, imagined: Any, memory: str) -> None:
-    """Raise ``PluginError`` when the figures of a memory are no numbers of items, some of them imagined."""
+def check_figures(figures: Any, memory: str) -> None:
+    """Raise ``PluginError`` when the figures of a memory are no numbers of items, some of them imagined.
+
+    Args:
+        figures: what ``Memory.figures`` returned.
+        memory: the memory's name.
+    """
+    if not hasattr(figures, "cells") or not hasattr(figures, "imagined"):
+        raise _broken("memory", memory, f"figures gave {_kind(figures)}, not MemoryFigures")
+    cells, imagined = figures.cells, figures.imagined
     if not all(isinstance(count, int) for count in (cells, imagined)) or not 0 <= imagined <= cells:
         raise _broken("memory", memory, f"figures gave {imagined!r} imagined of {cells!r} items")
 

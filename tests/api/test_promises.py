@@ -8,10 +8,11 @@ import pytest
 import torch
 
 from persist_cli.api.encoder import Encoder
+from persist_cli.api.memory import MapPoints, MemoryFigures
 from persist_cli.api.promises import (
     check_costs,
-    check_counts,
     check_features,
+    check_figures,
     check_generated,
     check_losses,
     check_points,
@@ -149,7 +150,6 @@ def test_what_can_be_no_memory_file_names_the_memory(tensors, cause):
 @pytest.mark.parametrize(
     ("positions", "colors", "cause"),
     [
-        (None, None, "positions as None"),
         (torch.ones(4, 2), torch.zeros(4, 3, dtype=torch.uint8), r"positions as float32 \[4, 2\]"),
         (torch.ones(4, 3), torch.zeros(5, 3, dtype=torch.uint8), r"colours as uint8 \[5, 3\], not uint8 \[4, 3\]"),
         (torch.full((4, 3), torch.nan), torch.zeros(4, 3, dtype=torch.uint8), "positions that are not finite"),
@@ -157,13 +157,26 @@ def test_what_can_be_no_memory_file_names_the_memory(tensors, cause):
 )
 def test_points_that_cannot_be_drawn_name_the_memory(positions, colors, cause):
     with pytest.raises(PluginError, match=f"^memory 'last': points gave {cause}"):
-        check_points(positions, colors, "last")
+        check_points(MapPoints(positions, colors), "last")
+
+
+def test_points_of_another_kind_or_with_other_origins_name_the_memory():
+    positions, colors = torch.ones(4, 3), torch.zeros(4, 3, dtype=torch.uint8)
+    with pytest.raises(PluginError, match=r"^memory 'last': points gave a tuple, not MapPoints"):
+        check_points((positions, colors), "last")
+    with pytest.raises(PluginError, match=r"^memory 'last': points gave origins as uint8 \[1\], not uint8 \[4\]"):
+        check_points(MapPoints(positions, colors, origins=torch.ones(1, dtype=torch.uint8)), "last")
 
 
 @pytest.mark.parametrize(("cells", "imagined"), [(3, 5), (3, -1), (3.5, 0), (torch.tensor(3), 0), (None, 0)])
 def test_figures_that_are_no_numbers_of_items_name_the_memory(cells, imagined):
     with pytest.raises(PluginError, match=r"^memory 'last': figures gave"):
-        check_counts(cells, imagined, "last")
+        check_figures(MemoryFigures(cells, 0, None, imagined), "last")
+
+
+def test_figures_of_another_kind_name_the_memory():
+    with pytest.raises(PluginError, match=r"^memory 'last': figures gave a int, not MemoryFigures"):
+        check_figures(3, "last")
 
 
 @pytest.mark.parametrize(
