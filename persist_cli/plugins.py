@@ -15,7 +15,7 @@ import sys
 from collections.abc import Iterator, Set
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, distributions, entry_points
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -56,7 +56,7 @@ KINDS: Final = {
 OWN: Final = ("persist_cli", "persist_backbones", "persist_memory")  # packages whose errors are bugs of ours
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, order=True)
 class Plugin:
     """A plugin before it is imported.
 
@@ -95,6 +95,20 @@ def list_plugins(kind: str) -> list[Plugin]:
     return list(_list_plugins(kind, _places()))
 
 
+def list_misplaced() -> list[tuple[Plugin, str]]:
+    """The entry points of groups such as ``persist.memory`` that are none of ``KINDS``, and what is wrong with each.
+
+    The kind of these plugins is the group.
+    """
+    groups = [kind.group for kind in KINDS.values()]
+    entries = {entry for installed in distributions() for entry in installed.entry_points}
+    return sorted(
+        (_describe(entry.group, entry), f"there is no group {entry.group!r}; {hint(entry.group, groups, 'groups')}")
+        for entry in entries
+        if entry.group.startswith("persist.") and entry.group not in groups
+    )
+
+
 def find_plugin(kind: str, name: str) -> Plugin:
     """The plugin of a name, which is not imported yet.
 
@@ -104,6 +118,9 @@ def find_plugin(kind: str, name: str) -> Plugin:
     installed = list_plugins(kind)
     plugins = [plugin for plugin in installed if plugin.name == name]
     if not plugins:
+        for plugin, cause in list_misplaced():
+            if plugin.name == name:
+                raise PluginError(f"{plugin.package} {plugin.version} has no {kind} {name!r}: {cause}", plugin.package)
         names = sorted({plugin.name for plugin in installed})
         raise PluginError(f"unknown {kind} {name!r}; {hint(name, names, 'installed')}")
     if len(plugins) > 1:

@@ -326,6 +326,15 @@ def test_a_name_that_two_packages_claim_is_an_error_that_names_both(persist, sit
     assert "claimed by 2 packages" in persist("plugins").out
 
 
+def test_an_entry_point_of_a_misspelt_group_is_shown_and_named(persist, site):
+    install(site, "persist-last", "persist.memory", "last = group_frame:LastFrame", LAST_FRAME)
+    rows = {row["name"]: row for row in json.loads(persist("plugins", "--json").out)}
+    cause = "there is no group 'persist.memory'; did you mean 'persist.memories'?"
+    assert (rows["last"]["kind"], rows["last"]["state"], rows["voxel"]["state"]) == ("persist.memory", cause, "ok")
+    with pytest.raises(PluginError, match=r"^persist-last 1\.2 has no memory 'last': there is no group 'persist\.mem"):
+        load_plugin("memory", "last")
+
+
 def test_an_unknown_plugin_is_an_error_with_the_nearest_name():
     with pytest.raises(PluginError, match="unknown memory 'voxle'; did you mean 'voxel'"):
         load_plugin("memory", "voxle")

@@ -7,13 +7,14 @@ from collections.abc import Sequence
 
 from persist_cli.errors import PluginError
 from persist_cli.output.console import print_json, print_table, say
-from persist_cli.plugins import KINDS, Plugin, first_line, import_plugin, list_plugins
+from persist_cli.plugins import KINDS, Plugin, first_line, import_plugin, list_misplaced, list_plugins
 from persist_cli.recipe import make_recipe, read_recipe, recipe_names
 
 
 def show_plugins(json: bool) -> None:
     """Import every plugin on its own, and print whether each can be used."""
     rows = [row for kind in KINDS for row in plugin_rows(list_plugins(kind))]
+    rows += [[entry.kind, entry.name, entry.package, entry.version, cause] for entry, cause in list_misplaced()]
     _show("Plugins", ("kind", "name", "package", "version", "state"), rows, json)
 
 
