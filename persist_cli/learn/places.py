@@ -89,7 +89,9 @@ class TruePlace:
         for start in starts:
             stance = self.simulator.stance(start.cameras.world_from_camera[0].numpy())
             if stance is None:
-                raise DataError(f"simulator {self.simulator.name!r} cannot be put at a camera's pose")
+                raise DataError(
+                    f"simulator {self.simulator.name!r} cannot be put at a camera's pose: its stance() is None"
+                )
             self._stances.append(stance)
 
     def act(self, ways: Mapping[int, Sequence[str]]) -> dict[int, StepResult]:

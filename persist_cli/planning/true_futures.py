@@ -64,7 +64,7 @@ def placed(simulator: Simulator, now: Observations) -> tuple[SimulatorFutures | 
     """Return the futures of a simulator whose agent is put where a frame was seen, unless it sees something else."""
     stance = simulator.stance(now.cameras.world_from_camera[0].numpy())
     if stance is None:
-        return None, f"simulator {simulator.name!r} cannot be put at a camera's pose"
+        return None, f"simulator {simulator.name!r} cannot be put at a camera's pose: its stance() is None"
     simulator.place(*stance)
     difference = np.abs(simulator.observe().rgb.astype(float) - now.rgb[0].numpy()).mean()
     if difference > ALIKE:

@@ -53,6 +53,9 @@ class CheckedSimulator(Simulator):
         info, bounds = self.given.info, self.given.bounds
         with faults_of("simulator", self.name):
             check_info(info, "the open scene")
+        lacking = [name for name in ("forward", "left", "right") if name not in info.vocabulary.names]
+        if lacking:
+            self._is_broken(f"its vocabulary lacks {', '.join(lacking)}; it has {', '.join(info.vocabulary.names)}")
         if not are_numbers(bounds, (2, 2)) or not np.all(np.asarray(bounds[0]) < np.asarray(bounds[1])):
             self._is_broken(f"bounds is {shown(bounds)}, not the lowest and the highest ground corner in metres")
         self.ahead(0.0)

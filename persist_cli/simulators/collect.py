@@ -32,7 +32,7 @@ from persist_cli.data.store import write_trajectory
 from persist_cli.errors import DataError
 from persist_cli.io.files import read_json, remove_leftovers, write_json
 from persist_cli.output.console import add_task, print_json, progress, say
-from persist_cli.plugins import check_simulator, load_plugin, make_settings, plugin_errors
+from persist_cli.plugins import check_simulator, list_plugins, load_plugin, make_settings, plugin_errors
 from persist_cli.simulators.checked import checked_simulator
 from persist_cli.simulators.free_grid import clear_distance
 from persist_cli.simulators.policies import POLICIES, walk
@@ -108,6 +108,8 @@ class CollectPlan:
             ("split", self.split, FIRST_SEED),
             ("depth sensor", self.depth_sensor, SENSORS),
         )
+        if self.policy not in POLICIES and self.policy in {plugin.name for plugin in list_plugins("policy")}:
+            raise DataError(f"policy {self.policy!r} is for plans; collect walks with {', '.join(POLICIES)}")
         for name, value, known in choices:
             if value not in known:
                 raise DataError(f"unknown {name} {value!r}; known: {', '.join(known)}")

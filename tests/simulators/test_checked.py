@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from persist_cli.api.actions import walking_actions
+from persist_cli.api.actions import free_motion, walking_actions
 from persist_cli.api.observations import Frame, TrajectoryInfo
 from persist_cli.api.simulator import Simulator
 from persist_cli.data.images import decode_depth, encode_depth
@@ -20,6 +20,7 @@ from persist_cli.episodes.find_episodes import EpisodeSearch
 from persist_cli.episodes.make_episodes import run_episodes
 from persist_cli.errors import DataError, PluginError
 from persist_cli.planning.futures import SimulatorFutures
+from persist_cli.planning.true_futures import placed
 from persist_cli.simulators.checked import checked_simulator
 from persist_cli.simulators.collect import CollectPlan, run_collect
 from tests.support.packages import install
@@ -126,6 +127,11 @@ def test_a_good_simulator_is_collected(collect, tmp_path: Path, policy: str) -> 
     assert [len(file) for file in Store(tmp_path / "out")] == [24, 24]
 
 
+def test_a_policy_of_plans_is_no_walk_of_collect(collect) -> None:
+    with pytest.raises(DataError, match=r"^policy 'straight' is for plans; collect walks with explore, path, "):
+        collect(replace(PLAN, policy="straight"))
+
+
 def test_answers_may_have_values_of_numpy(collect, tmp_path: Path) -> None:
     bounds = np.array([[-SIDE, -SIDE], [SIDE, SIDE]])
     collect(bounds=bounds, is_free=np.bool_(True), ahead=np.array, act=np.bool_(True))
@@ -138,6 +144,7 @@ def test_answers_may_have_values_of_numpy(collect, tmp_path: Path) -> None:
         ({"info": None}, "the open scene: its info is None, no TrajectoryInfo"),
         ({"change": {"world_up": None}}, "the open scene: world_up None is not a unit vector of three numbers"),
         ({"change": {"source": None}}, "the open scene: its source is None, not a dictionary"),
+        ({"change": {"vocabulary": free_motion()}}, "its vocabulary lacks forward, left, right; it has free"),
         ({"change": {"height": 4}}, "observe(): rgb is uint8 [8, 8, 3], not uint8 [4, 8, 3]"),
         ({"bounds": None}, "bounds is None, not the lowest and the highest ground corner in metres"),
         ({"bounds": ((-math.inf, 0), (math.inf, 1))}, "bounds is ((-inf, 0), (inf, 1)), not the lowest and"),
@@ -231,6 +238,13 @@ def test_a_stance_that_is_none_is_refused(hall, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(Hall, "stance", lambda self, pose: (0.0, 0.0, 0.0))
     with pytest.raises(PluginError, match=r"is broken: stance\(\) returned \(0.0, 0.0, 0.0\), not \(\(x, y\)"):
         simulator.stance(np.eye(4))
+
+
+def test_a_simulator_without_stance_is_said_to_lack_it_where_a_plan_asks_for_the_truth(collect, tmp_path) -> None:
+    collect()
+    now = next(iter(Store(tmp_path / "out"))).read().observations[:1]
+    simulator = checked_simulator("hall", SIZE)
+    assert placed(simulator, now) == (None, "simulator 'hall' cannot be put at a camera's pose: its stance() is None")
 
 
 @pytest.mark.parametrize(("option", "setting"), [("height", "camera_height"), ("fov", "fov"), ("pitch", "pitch")])
