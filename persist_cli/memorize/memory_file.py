@@ -40,8 +40,12 @@ def load_memory(path: Path) -> Memory:
         with_scene_model(memory).restore(tensors)
     except PersistError as error:
         raise type(error)(f"{path}: {error}") from error
-    if memory.figures().cells != header["cells"]:
-        raise CheckpointError(f"{path}: holds {memory.figures().cells} cells, its header says {header['cells']}")
+    restored = memory.figures().cells
+    if restored != header["cells"]:
+        raise CheckpointError(
+            f"{path}: memory {memory.name!r} restored {restored} cells, the header says {header['cells']}; the file is "
+            "damaged, or restore() forgets what tensors() gave"
+        )
     return memory
 
 

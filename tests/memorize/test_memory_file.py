@@ -86,7 +86,7 @@ def test_a_missing_file_and_a_foreign_file_have_different_errors(tmp_path):
         ({"world_up": [0, 0, 0]}, "header is damaged .see world_up"),
         ({"channels": None}, "header is damaged .see channels"),
         ({"channels": 16}, "written with 16 channels"),
-        ({"cells": 3}, "its header says 3"),
+        ({"cells": 3}, "the header says 3; the file is damaged, or restore"),
         ({"encoder": "gone"}, "unknown encoder 'gone'"),
         ({"memory": "map2d"}, "cell"),
         ({"settings": {"cells": 1}}, "did you mean 'cell'"),
