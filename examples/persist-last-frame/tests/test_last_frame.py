@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
 
@@ -9,7 +11,8 @@ from persist_cli.api.memory import FrameOfReference
 from persist_cli.api.observations import Observations, Origin
 from persist_cli.data.reference import parse_reference
 from persist_cli.errors import CheckpointError
-from persist_cli.plugins import make_encoder
+from persist_cli.memorize.memory_file import load_memory
+from persist_cli.plugins import make_encoder, make_memory
 from persist_last_frame import LastFrame, LastFrameSettings
 
 
@@ -51,6 +54,24 @@ def test_an_emptied_memory_gives_no_token(frames: Observations) -> None:
     memory.write(frames)
     memory.clear()
     assert (len(memory.read(frames.cameras, 100)), memory.tensors()) == (0, {})
+
+
+def test_a_saved_memory_is_read_as_it_was_written(frames: Observations, tmp_path: Path) -> None:
+    memory = make_memory("last", {"most": 9}, empty().encoder, FrameOfReference("house"))
+    memory.write(frames)
+    memory.save(tmp_path / "last.safetensors")
+    again = load_memory(tmp_path / "last.safetensors")
+    for path in (frames.cameras[:1], frames.cameras):
+        assert torch.equal(again.read(path, 100).features, memory.read(path, 100).features)
+        assert torch.equal(again.read(path, 100).positions, memory.read(path, 100).positions)
+
+
+def test_what_is_written_into_a_copy_does_not_change_the_memory(frames: Observations) -> None:
+    memory = empty()
+    memory.write(frames[:1])
+    before = memory.read(frames.cameras, 100).features.clone()
+    memory.copy().write(frames[1:])
+    assert torch.equal(memory.read(frames.cameras, 100).features, before)
 
 
 def test_a_copy_reads_the_same_and_foreign_tensors_are_refused(frames: Observations) -> None:
