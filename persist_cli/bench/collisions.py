@@ -26,7 +26,7 @@ from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.observations import Frame, Observations, TrajectoryInfo
 from persist_cli.api.simulator import Simulator, random_ground
 from persist_cli.checkpoints.contamination import ShownScene, refuse_training_scenes, scenes_to_avoid
-from persist_cli.checkpoints.load import adapter_memory, load_adapter, load_backbone
+from persist_cli.checkpoints.load import load_adapter, load_backbone
 from persist_cli.checkpoints.placement import check_placement
 from persist_cli.episodes.true_scene import observations_of
 from persist_cli.errors import DataError
@@ -237,7 +237,7 @@ def measure(
         for name, adapter in adapters.items():
             load_adapter(backbone, checkpoint, adapter)
             backbone.prepare_inference(placement)
-            factory = None if adapter is None else MemoryFactory.of(adapter_memory(checkpoint, adapter))
+            factory = None if adapter is None else MemoryFactory.of_adapter(checkpoint, adapter)
             bar.update(task, note=f"{name} imagines")
             for walks in houses:
                 seen = imagined(walks, backbone, factory, sampling)

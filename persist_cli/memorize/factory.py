@@ -9,12 +9,14 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
 from persist_cli.api.backbone import Clip
+from persist_cli.api.checkpoint import Checkpoint
 from persist_cli.api.encoder import Encoder
 from persist_cli.api.memory import FrameOfReference, Memory
 from persist_cli.api.observations import TrajectoryInfo
 from persist_cli.api.scene import Scene
+from persist_cli.checkpoints.load import adapter_memory
 from persist_cli.data.clips import ClipSample
-from persist_cli.errors import RecipeError
+from persist_cli.errors import PersistError, RecipeError
 from persist_cli.io.settings import parse_settings
 from persist_cli.memorize.imagining import with_scene_model
 from persist_cli.memorize.kept_features import KeptFeatures
@@ -59,6 +61,19 @@ class MemoryFactory:
             while len(_KEPT) > MOST_KEPT:
                 _KEPT.popitem(last=False)
         return MemoryFactory(kind, settings, encoder.placed(device), device)
+
+    @staticmethod
+    def of_adapter(checkpoint: Checkpoint, adapter: str, device: torch.device | str = "cpu") -> MemoryFactory:
+        """Return the factory of the memory that an adapter of a checkpoint reads, computing on ``device``.
+
+        Raises:
+            PersistError: naming the adapter, when its plugins are not installed or now have other settings.
+        """
+        config = adapter_memory(checkpoint, adapter)
+        try:
+            return MemoryFactory.of(config, device)
+        except PersistError as error:
+            raise type(error)(f"adapter {adapter!r} of {checkpoint.folder}: {error}") from error
 
     def empty(self, info: TrajectoryInfo) -> Memory:
         """Return an empty memory in the world of a trajectory."""

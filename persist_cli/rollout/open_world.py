@@ -154,7 +154,7 @@ def empty_memory(
 ) -> Memory | None:
     """Return an empty memory of the adapter's kind, ``None`` without an adapter, which reads no file."""
     if adapter is not None:
-        return MemoryFactory.of(adapter_memory(checkpoint, adapter)).empty(info)
+        return MemoryFactory.of_adapter(checkpoint, adapter).empty(info)
     if options.memory is not None:
         without = f"--adapter {PLAIN} is the model" if options.adapter else f"{checkpoint.folder}: is a model"
         raise CheckpointError(f"{without} without a memory adapter, which cannot read {options.memory}")

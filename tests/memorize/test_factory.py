@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
+import shutil
+
 import pytest
 import torch
 
+from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.data.clips import ClipDataset, ClipPlan
 from persist_cli.data.store import Store
-from persist_cli.errors import RecipeError
+from persist_cli.errors import PersistError, RecipeError
 from persist_cli.memorize.factory import MemoryFactory, with_memory
 from persist_cli.memorize.imagining import of_known_cells
 from persist_cli.recipe import MemoryConfig
@@ -24,6 +28,23 @@ def test_an_encoder_computes_on_the_device_of_its_factory(tmp_path):
     images = torch.zeros(2, 28, 28, 3, dtype=torch.uint8)
     assert MemoryFactory.of(config, torch.device("meta")).encoder.encode(images).is_meta
     assert not MemoryFactory.of(config).encoder.encode(images).is_meta
+
+
+@pytest.mark.parametrize(
+    ("changes", "cause"),
+    [
+        ({"encoder": "edges"}, "unknown encoder 'edges'; installed: classes, "),
+        ({"settings": {"edge": 1}}, "memory 'voxel': unknown key 'edge'"),
+    ],
+)
+def test_an_adapter_whose_plugin_is_gone_or_another_one_is_named(codec, stage1, voxel, tmp_path, changes, cause):
+    for run in (codec, stage1, voxel):
+        shutil.copytree(run, tmp_path / run.name)
+    checkpoint = find_checkpoint(tmp_path / "voxel")
+    file = checkpoint.adapter_folder("voxel") / "memory.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | changes))
+    with pytest.raises(PersistError, match=rf"^adapter 'voxel' of {tmp_path}/voxel/step-00000004.*: {cause}"):
+        MemoryFactory.of_adapter(checkpoint, "voxel")
 
 
 def test_memories_of_one_costly_encoder_share_its_weights_and_features():

@@ -390,7 +390,7 @@ class RowLoader:
         backbone.prepare_inference(self.bench.plan.placement)
         sampling = checkpoint.sampling_with(self.bench.plan.sampling)
         backbone.check_sampling(sampling)
-        memory = None if adapter is None else MemoryFactory.of(adapter_memory(checkpoint, adapter), backbone.device)
+        memory = None if adapter is None else MemoryFactory.of_adapter(checkpoint, adapter, backbone.device)
         return dataclasses.replace(parts, backbone=backbone, factory=memory, sampling=sampling)
 
 

@@ -13,7 +13,7 @@ from persist_cli.api.scene_model import SceneModel
 from persist_cli.bench.scenes.completions import Scenes
 from persist_cli.bench.scenes.scene_bench import RenderingPlan, SceneBench
 from persist_cli.bench.scenes.views import View
-from persist_cli.checkpoints.load import adapter_memory, load_adapter
+from persist_cli.checkpoints.load import load_adapter
 from persist_cli.checkpoints.placement import check_placement
 from persist_cli.data.clips import check_size
 from persist_cli.errors import PersistError
@@ -104,7 +104,7 @@ def rendered_rows(plan: RenderingPlan) -> list[RenderedRow]:
 
 def draws_scenes(plan: RenderingPlan, adapter: str) -> bool:
     """Return whether the memory of an adapter is a scene."""
-    return issubclass(MemoryFactory.of(adapter_memory(find_checkpoint(plan.checkpoint), adapter)).kind, Scene)
+    return issubclass(MemoryFactory.of_adapter(find_checkpoint(plan.checkpoint), adapter).kind, Scene)
 
 
 def scene_row(rows: Sequence[RenderedRow]) -> RenderedRow:
@@ -146,5 +146,5 @@ class RendererLoader:
         backbone.check_sampling(sampling)
         factory = None
         if row.adapter is not None:
-            factory = MemoryFactory.of(adapter_memory(self.checkpoint, row.adapter), backbone.device)
+            factory = MemoryFactory.of_adapter(self.checkpoint, row.adapter, backbone.device)
         return Renderer(row, backbone, sampling, factory, self.bench.scenes.model)

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 from persist_cli.api.backbone import Sampling
 from persist_cli.api.checkpoint import PLAIN, Checkpoint
 from persist_cli.api.memory import Memory
-from persist_cli.checkpoints.load import adapter_memory
 from persist_cli.errors import CheckpointError, DataError, PersistError, hint
 from persist_cli.evaluate.cases import Case
 from persist_cli.evaluate.protocols import Protocol
@@ -135,7 +134,7 @@ def build_model_rows(checkpoints: Sequence[Checkpoint], config: RowConfig, proto
     for memory in config.memories:
         adapter = None if memory == PLAIN else memory
         for name, group, owner in named_owners(memory, checkpoints_with(memory, checkpoints), config.training_seeds):
-            factory = MemoryFactory.of(adapter_memory(owner, memory)) if adapter else None
+            factory = MemoryFactory.of_adapter(owner, memory) if adapter else None
             row_memory = RowMemory(factory, Unmodified(), protocol.writes)
             row = ModelRow(name, owner, adapter, config.sampling_of.get(memory, config.sampling), row_memory)
             row.own_sampling = memory in config.sampling_of
