@@ -198,8 +198,9 @@ def _wrong_member(loaded: type, base: type, name: str) -> str:
     own, given = inspect.getattr_static(base, name), inspect.getattr_static(loaded, name)
     if given is own or (hasattr(given, "__get__") and not callable(given)):  # a property, or a class method
         return ""
-    if isinstance(own, property):
-        return f"its {name} is a method; write @property above it" if inspect.isfunction(given) else ""
+    if isinstance(own, property | classmethod):
+        word = "property" if isinstance(own, property) else "classmethod"
+        return f"its {name} is a plain method; write @{word} above it" if inspect.isfunction(given) else ""
     if isinstance(own, bool | int | str | frozenset):
         kind = Set if isinstance(own, frozenset) else type(own)
         return "" if isinstance(given, kind) else f"its {name} is {given!r}, no {type(own).__name__}"

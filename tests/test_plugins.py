@@ -168,6 +168,7 @@ UNFINISHED = """
     from dataclasses import dataclass
     from persist_cli.api.memory import Memory
     from persist_cli.api.encoder import Encoder
+    from persist_cli.api.simulator import Simulator
 
     class Unfinished(Memory):
         def read(self, cameras, budget): pass
@@ -202,6 +203,11 @@ UNFINISHED = """
     class Method(Unset):
         settings_type = Memory.settings_type
         def channels(self): return 3
+
+    class Missing(Simulator):
+        agent = bounds = info = None
+        open_scene = place = observe = act = is_free = ahead = lambda self, *parts: None
+        def missing(self): return ""
 """
 
 
@@ -212,7 +218,7 @@ UNFINISHED = """
      ("encoder", "Unset", "its settings_type is no dataclass"),
      ("memory", "Short", "its read does not take (cameras, budget)"),
      ("memory", "Hidden", "its reads_depth is 'no', no bool"),
-     ("encoder", "Method", "its channels is a method; write @property above it"),
+     ("encoder", "Method", "its channels is a plain method; write @property above it"),
      ("memory", "function", "it is no subclass of persist_cli.api.memory.Memory"),
      ("memory", "Absent", "AttributeError: module 'unfinished' has no attribute 'Absent'")],
 )  # fmt: skip
@@ -227,6 +233,12 @@ def test_an_unfinished_plugin_is_shown_as_broken_and_refused_in_one_line(persist
     with pytest.raises(PluginError) as error:
         load_plugin(kind, "unfinished")
     assert (error.value.package, error.value.cause) == ("persist-unfinished", cause)
+
+
+def test_a_method_that_asks_the_class_has_to_be_one_of_the_class(site):
+    install(site, "persist-unfinished", "persist.simulators", "unfinished = unfinished:Missing", UNFINISHED)
+    with pytest.raises(PluginError, match="is broken: its missing is a plain method; write @classmethod above it"):
+        load_plugin("simulator", "unfinished")
 
 
 def test_a_method_that_takes_more_than_it_is_given_can_be_used(site):
