@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import pytest
 
@@ -295,6 +296,25 @@ def test_a_plugin_that_inherits_its_method_from_another_one_is_named_itself(pers
     install(site, "persist-child", "persist.memories", "child = child_frame:Child", child)
     ended = persist("memorize", f"{walks}#0:0-3", "--memory", "child", "--out", site / "m.safetensors")
     assert "memory 'child' (persist-child 1.2, child_frame:Child) failed in LastFrame.write: AttributeErr" in ended.err
+
+
+@pytest.mark.parametrize(
+    ("method", "cause"),
+    [
+        ("def restore(self, tensors): pass", "restore made 0 items .* of what tensors gave, which was 16 items .*"),
+        ("def copy(self): return self", "copy gave itself, not another memory"),
+        ("def tensors(self): return None", "tensors gave None, not tensors by name"),
+        ("def points(self): return (), ()", "points gave a tuple, not MapPoints"),
+        ("def copy(self): pass", "copy gave NoneType, not another memory"),
+    ],
+)
+def test_a_memory_that_could_not_be_read_again_ends_memorize_at_once(persist, site, walks, method, cause):
+    code = LAST_FRAME + f"\n    class Mine(LastFrame):\n        {method}\n"
+    module = f"mine_{len(method)}"
+    install(site, "persist-mine", "persist.memories", f"mine = {module}:Mine", code)
+    ended = persist("memorize", f"{walks}#0:0-3", "--memory", "mine", "--out", site / "m.safetensors")
+    assert (ended.code, (site / "m.safetensors").exists()) == (1, False)
+    assert re.match(f"error: memory 'mine': {cause}\n$", ended.err)
 
 
 def test_an_error_of_several_lines_is_printed_in_one(persist, site, walks):

@@ -184,6 +184,25 @@ class Memory(ABC):
         copy.restore({name: tensor.clone() for name, tensor in self.tensors().items()})
         return copy
 
+    def check_copy(self) -> None:
+        """Raise ``PluginError`` when a copy of this memory is none, or holds another number of items or bytes.
+
+        A copy is made of ``tensors`` by ``restore``, as a memory that is read from its file.
+        """
+        check_stored(self.tensors(), self.name, PATH)
+        copy = self.copy()
+        if not isinstance(copy, Memory) or copy is self:
+            given = "itself" if copy is self else type(copy).__name__
+            raise PluginError(f"memory {self.name!r}: copy gave {given}, not another memory")
+        for memory in (self, copy):
+            check_points(memory.points(), self.name)
+            check_figures(memory.figures(), self.name)
+        own, copied = self.figures(), copy.figures()
+        if (own.cells, own.imagined, own.bytes) != (copied.cells, copied.imagined, copied.bytes):
+            text = "{0.cells} items ({0.imagined} imagined) of {0.bytes:,} bytes"
+            what = f"restore made {text.format(copied)} of what tensors gave"
+            raise PluginError(f"memory {self.name!r}: {what}, which was {text.format(own)}")
+
     @abstractmethod
     def tensors(self) -> dict[str, Tensor]:
         """Return the stored tensors by name, in an order that does not depend on the order of writing."""

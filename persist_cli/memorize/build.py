@@ -129,7 +129,10 @@ def run_merge(paths: list[Path], out: Path, json: bool) -> None:
 def write_sources(memory: Memory, sources: Sequence[Source]) -> float:
     """Write all frames into the memory, a few at a time, and return the duration in seconds.
 
+    That the memory can be read again is checked after the first of them, not after hours.
+
     Raises:
+        PluginError: when it cannot.
         DataError: naming the trajectory and the frame that the memory cannot take.
     """
     start = time.perf_counter()
@@ -143,6 +146,8 @@ def write_sources(memory: Memory, sources: Sequence[Source]) -> float:
                     memory.memorize(piece)
                 except FrameError as error:
                     raise DataError(f"{source.file.path}: frame {first + error.frame}: {error.cause}") from error
+                if first == sources[0].frames.start and source is sources[0]:
+                    memory.check_copy()
                 first += len(piece)
                 bar.advance(task, len(piece))
     return time.perf_counter() - start
