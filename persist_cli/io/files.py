@@ -59,7 +59,7 @@ def written_aside(path: Path) -> Iterator[Path]:
     aside = _path_aside(path)
     try:
         yield aside
-        with aside.open("rb") as file:
+        with aside.open("r+b") as file:  # Windows syncs no file that is open for reading alone
             os.fsync(file.fileno())
         aside.replace(path)
     except BaseException:
@@ -71,9 +71,9 @@ def written_aside(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write text, whole or not at all."""
+    """Write text, whole or not at all; the same bytes on every system, as lists of hashes expect."""
     with written_aside(path) as aside:
-        aside.write_text(text, encoding="utf-8")
+        aside.write_text(text, encoding="utf-8", newline="\n")
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -61,7 +61,8 @@ def rewrite_files(texts: Mapping[Path, Mapping[str, str]]) -> None:
             if sums is not None:
                 written[SUMS] = _text(sums | {name: _sha256(text) for name, text in files.items()})
             for name, text in written.items():
-                stack.enter_context(written_aside(folder / name)).write_text(text, encoding="utf-8")
+                aside = stack.enter_context(written_aside(folder / name))
+                aside.write_text(text, encoding="utf-8", newline="\n")
 
 
 def read_sums(folder: Path) -> dict[str, str] | None:

@@ -21,10 +21,12 @@ from persist_cli.io.files import (
     write_text,
     written_aside,
 )
+from persist_cli.io.sha256sums import check_sums, rewrite_files, write_sums
 from tests.support.disk import file_limit
 from tests.support.export_runs import write_base
 from tests.support.micro_model import micro
 from tests.support.misaligned import ALIGNMENT, write_misaligned
+from tests.support.windows import as_on_windows
 
 
 def test_a_failed_writer_leaves_the_old_file_and_nothing_else(tmp_path):
@@ -33,6 +35,17 @@ def test_a_failed_writer_leaves_the_old_file_and_nothing_else(tmp_path):
         pass  # writes nothing, as with a full disk
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
     assert (tmp_path / "a.txt").read_text() == "old"
+
+
+def test_files_are_synced_and_have_the_hashes_that_are_listed_on_windows_too(tmp_path, monkeypatch):
+    as_on_windows(monkeypatch)
+    write_tensors(tmp_path / "a.safetensors", {"a": torch.ones(3)})
+    write_text(tmp_path / "recipe.yaml", "a: 1\nb: 2\n")
+    assert (tmp_path / "recipe.yaml").read_bytes() == b"a: 1\nb: 2\n"
+    write_sums(tmp_path)
+    rewrite_files({tmp_path: {"recipe.yaml": "a: 1\nb: 3\n"}})
+    check_sums(tmp_path)
+    assert b"\r" not in (tmp_path / "SHA256SUMS").read_bytes()
 
 
 def test_tensors_are_read_into_memory_that_torch_allocated(tmp_path):
