@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ from persist_cli.api.checkpoint import STEP, Checkpoint, step_folders
 from persist_cli.checkpoints.lineage import RECIPE
 from persist_cli.errors import PersistError
 from persist_cli.io.command_line import quoted
-from persist_cli.io.files import empty_folder_aside, read_json, write_json
+from persist_cli.io.files import empty_folder_aside, read_json, relative_place, write_json
 from persist_cli.output.console import warn
 from persist_cli.recipe import recipe_values
 
@@ -52,7 +51,7 @@ def mark_in_use(checkpoint: Checkpoint, run: Path) -> None:
         if path.is_file():
             continue
         try:
-            write_json(path, {"checkpoint": step.name, "run": os.path.relpath(user, step.parent)})
+            write_json(path, {"checkpoint": step.name, "run": relative_place(user, step.parent)})
         except OSError as error:
             if not ended_recipe(step):
                 warn(

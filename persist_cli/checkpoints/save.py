@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import os
 from collections.abc import Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 from persist_cli.api.checkpoint import CARD, REFERENCE, STARTED_FROM, VERSION, Checkpoint
 from persist_cli.api.inference import CONSISTENCY
 from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.checkpoints.lineage import MEMORY_FILE
-from persist_cli.io.files import bundled_folder, write_json
+from persist_cli.io.files import bundled_folder, relative_place, write_json
 from persist_cli.io.sha256sums import hash_files, write_sums
 from persist_cli.recipe import MemoryConfig
 
@@ -133,9 +132,9 @@ def hash_weights(folder: Path) -> dict[str, str]:
 def fingerprint(hashes: Mapping[str, str]) -> str:
     """SHA-256 over all weight files of a checkpoint's base, in order of their paths, given those of the files."""
     digest = hashlib.sha256()
-    for path in sorted(map(Path, hashes)):
+    for path in sorted(map(PurePosixPath, hashes)):
         digest.update(str(path).encode())
-        digest.update(bytes.fromhex(hashes[path.as_posix()]))
+        digest.update(bytes.fromhex(hashes[str(path)]))
     return digest.hexdigest()
 
 
@@ -154,5 +153,5 @@ def card_fingerprint(hashes: Mapping[str, str], card: dict[str, Any]) -> str:
 def pointer_to(base: Path, fingerprint: str, home: Path) -> dict[str, str]:
     """The values of a card that point to a base: its folder relative to ``home``, or its name, and its fingerprint."""
     packaged = base.resolve() == bundled_folder(REFERENCE).resolve()
-    place = REFERENCE if packaged else os.path.relpath(base.resolve(), home.resolve())
+    place = REFERENCE if packaged else relative_place(base.resolve(), home.resolve())
     return {"base": place, "fingerprint": fingerprint}

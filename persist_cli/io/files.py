@@ -290,6 +290,14 @@ def _path_aside(path: Path) -> Path:
     return path.parent / f"{ASIDE}{uuid.uuid4().hex[:8]}-{path.name}"
 
 
+def relative_place(path: Path, folder: Path) -> str:
+    """A resolved path as seen from a resolved folder, with slashes; absolute on another drive of Windows."""
+    try:
+        return Path(os.path.relpath(path, folder)).as_posix()
+    except ValueError:
+        return path.as_posix()
+
+
 def bundled_folder(name: str) -> Path:
     """The folder of this name beside the recipes, or where the environment variable says; it need not exist."""
     return Path(os.environ.get(ENVIRONMENT) or str(resources.files("persist_recipes"))) / name

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import ntpath
 import os
 import stat
+from pathlib import PureWindowsPath
 
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
 from persist_backbones.pipeline.pipeline import WorldPipeline
+from persist_cli.checkpoints import save
 from persist_cli.errors import CheckpointError
+from persist_cli.io import files
 from persist_cli.io.files import (
     ASIDE,
     folder_aside,
     read_json,
     read_tensors,
+    relative_place,
     remove_leftovers,
     write_tensors,
     write_text,
@@ -46,6 +51,18 @@ def test_files_are_synced_and_have_the_hashes_that_are_listed_on_windows_too(tmp
     rewrite_files({tmp_path: {"recipe.yaml": "a: 1\nb: 3\n"}})
     check_sums(tmp_path)
     assert b"\r" not in (tmp_path / "SHA256SUMS").read_bytes()
+
+
+def test_places_and_fingerprints_are_the_same_text_on_windows(monkeypatch):
+    weights = {"vae/a.safetensors": "00" * 32, "transformer/a.safetensors": "ff" * 32}
+    here = save.fingerprint(weights)
+    monkeypatch.setattr(save, "Path", PureWindowsPath)
+    assert save.fingerprint(weights) == here
+    monkeypatch.setattr(files, "Path", PureWindowsPath)
+    monkeypatch.setattr(os.path, "relpath", ntpath.relpath)
+    base, run = PureWindowsPath("C:/runs/stage1/model"), PureWindowsPath("C:/runs/voxel")
+    assert relative_place(base, run) == "../stage1/model"
+    assert relative_place(base, PureWindowsPath("D:/runs")) == "C:/runs/stage1/model"
 
 
 def test_tensors_are_read_into_memory_that_torch_allocated(tmp_path):
