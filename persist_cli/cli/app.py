@@ -35,6 +35,7 @@ from persist_cli.cli.options import (
     TurnOption,
     VerifyOption,
     limit_spinning,
+    print_any_letter,
     refuse_other_options,
     show_version,
 )
@@ -73,13 +74,14 @@ def main(arguments: list[str] | None = None) -> None:
     Where the environment sets PERSIST_TRACEBACK, the traceback of that error is printed before.
     """
     limit_spinning(os.environ)
+    print_any_letter()
     try:
         commands()(args=arguments)
     except PersistError as error:
         if os.environ.get(TRACEBACK):
             traceback.print_exc()
         line = " ".join(str(error).split("\n"))  # a plugin's message may have several
-        typer.secho(f"error: {line}", fg=typer.colors.RED, err=True)
+        typer.secho(f"error: {line}", fg=None if os.environ.get("NO_COLOR") else typer.colors.RED, err=True)
         sys.exit(1)
 
 

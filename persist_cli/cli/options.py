@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import errno
+import io
 import signal
+import sys
 import threading
 from collections.abc import Iterator, MutableMapping
 from pathlib import Path
@@ -204,6 +207,18 @@ def limit_spinning(environment: MutableMapping[str, str]) -> None:
         environment["GOMP_SPINCOUNT"] = SPINS
 
 
+def print_any_letter() -> None:
+    """Let standard output show question marks for letters that its encoding lacks, and any file name as it is.
+
+    By default the first such letter ends a command with a traceback, after its work: in a pipe on Windows, in a locale
+    without UTF-8, and where the name of a file is not UTF-8.
+    """
+    out = sys.stdout
+    if isinstance(out, io.TextIOWrapper) and out.errors in ("strict", "surrogateescape"):
+        is_utf = codecs.lookup(out.encoding).name.startswith("utf")
+        out.reconfigure(errors="surrogateescape" if is_utf else "replace")
+
+
 def split_names(text: str) -> tuple[str, ...]:
     """The names in a list separated by commas."""
     return tuple(name.strip() for name in text.split(",") if name.strip())
@@ -262,6 +277,10 @@ class Commands(TyperGroup):
             raise
         except OSError as error:
             raise PersistError(system_error(error)) from error
+        except UnicodeEncodeError as error:
+            if error.reason != "surrogates not allowed":
+                raise
+            raise PersistError(f"{shown_name(error)}: holds letters that are not UTF-8; rename it") from error
         except KeyboardInterrupt as stop:
             typer.secho("stopped; what is written is whole, the same command goes on with it or begins anew", err=True)
             raise typer.Exit(TERMINATED if isinstance(stop, Terminated) else INTERRUPTED) from None
@@ -275,6 +294,12 @@ def system_error(error: OSError) -> str:
     if error.filename and error.strerror:
         return f"{error.filename}: {error.strerror}"
     return " ".join(str(error).split()) or type(error).__name__
+
+
+def shown_name(error: UnicodeEncodeError) -> str:
+    """The line around a letter of a file's name that is not UTF-8, in which the letter is a question mark."""
+    start = error.object.rfind("\n", 0, error.start) + 1
+    return error.object[start:].splitlines()[0].encode(errors="replace").decode()
 
 
 class Terminated(KeyboardInterrupt):

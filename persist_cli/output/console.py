@@ -223,8 +223,17 @@ def busy(description: str, bar_of_its_own: bool = False) -> Iterator[None]:
 
 
 def print_json(value: Any) -> None:
-    """Print a value as JSON on standard output; NaN and infinity become null."""
-    OUT.print_json(json.dumps(plain(value), allow_nan=False))
+    """Print a value as JSON on standard output; NaN and infinity become null.
+
+    Where its letters cannot be printed they are escaped, so that it stays JSON.
+    """
+    text = json.dumps(plain(value), allow_nan=False, ensure_ascii=False)
+    try:
+        text.encode(OUT.encoding)
+    except UnicodeEncodeError:
+        OUT.print_json(text, ensure_ascii=True)
+    else:
+        OUT.print_json(text)
 
 
 def print_table(

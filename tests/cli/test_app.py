@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import errno
+import io
+import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,8 +14,10 @@ import sys
 import pytest
 import typer
 
-from persist_cli.cli.options import Commands
+from persist_cli.cli.app import main
+from persist_cli.cli.options import Commands, print_any_letter
 from persist_cli.io.command_line import running_command
+from persist_cli.output.console import print_json, say
 from tests.support.disk import file_limit
 from tests.support.micro_runs import MICRO_SETTINGS, stage
 
@@ -166,3 +171,55 @@ def test_a_stage_that_begins_with_a_random_codec_warns(persist, walks, codec, tm
     assert (ended.code, "begins with random weights" in ended.err) == (0, True)
     ended = persist(*stage("stage1", walks, tmp_path / "b", f"base={codec}", "training.steps=1"))
     assert (ended.code, "random" in ended.err) == (0, False)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "cp1252"])
+def test_what_an_encoding_cannot_print_is_a_question_mark_in_text_and_escaped_in_json(encoding, monkeypatch):
+    printed = {}
+    for arguments in (["recipes", "houses-64-paper"], ["recipes", "houses-64-paper", "--json"], ["eval", "--help"]):
+        out = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
+        monkeypatch.setattr(sys, "stdout", out)
+        with pytest.raises(SystemExit) as ended:
+            main(arguments)
+        assert not ended.value.code
+        out.flush()
+        printed[arguments[-1]] = out.buffer.getvalue().decode(encoding)
+    assert "?" in printed["houses-64-paper"]
+    assert json.loads(printed["--json"])["recipe"] == "houses-64-paper"
+    assert "?" not in printed["--json"].replace("?,", "")
+    assert "--memories" in printed["--help"]
+
+
+def test_the_name_of_a_file_is_printed_as_the_system_has_it(monkeypatch):
+    out = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")
+    monkeypatch.setattr(sys, "stdout", out)
+    print_any_letter()
+    say(os.fsdecode(b"runs/caf\xe9: written"))
+    print_json({"out": os.fsdecode(b"runs/caf\xe9"), "size": "\N{GREEK SMALL LETTER MU}"})
+    out.flush()
+    line, printed = out.buffer.getvalue().split(b"\n", 1)
+    assert line == b"runs/caf\xe9: written"
+    assert json.loads(printed) == {"out": os.fsdecode(b"runs/caf\xe9"), "size": "\N{GREEK SMALL LETTER MU}"}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems refuse such names")
+def test_a_name_that_is_not_utf_8_is_one_line_where_it_cannot_be_used(persist, walks, tmp_path):
+    data = tmp_path / os.fsdecode(b"caf\xe9")
+    shutil.copytree(walks, data)
+    ended = persist("inspect", data)
+    assert (ended.code, "not UTF-8; rename it" in ended.err) == (1, True)
+    assert len(ended.err.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize("no_color", ["", "1"])
+def test_an_error_is_red_on_a_terminal_unless_the_user_wants_no_color(no_color, monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    terminal = Terminal()
+    monkeypatch.setenv("NO_COLOR", no_color)
+    monkeypatch.setattr(sys, "stderr", terminal)
+    with pytest.raises(SystemExit):
+        main(["recipes", "none"])
+    assert ("\x1b[31m" in terminal.getvalue()) == (not no_color)
