@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import dataclass
 from typing import Final
 
+import psutil
 import torch
 
 from persist_cli.errors import PersistError
@@ -58,7 +58,7 @@ def machine_of(gpus: int | None, gpu_memory: float | None) -> Machine:
         raise PersistError(f"--gpu-memory {gpu_memory}: give the GB of a card, as in 80")
     here = torch.cuda.device_count()
     if gpus is None and gpu_memory is None and not here:
-        return Machine("cpu", 1, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+        return Machine("cpu", 1, psutil.virtual_memory().total)
     if gpu_memory is None and not here:
         raise PersistError("--gpus: there is no GPU here to know its memory of; give --gpu-memory GB, as in 80")
     memory = torch.cuda.get_device_properties(0).total_memory if gpu_memory is None else round(gpu_memory * GIB)

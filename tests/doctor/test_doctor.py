@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import os
 import shlex
 import sys
 from pathlib import Path
@@ -16,7 +17,7 @@ from persist_cli.api.backbone import Backbone
 from persist_cli.api.clips import ClipLatents
 from persist_cli.doctor.changes import CHECKPOINTING, EIGHT_BIT, FROZEN, LORA, OFFLOAD, Strategy, strategies
 from persist_cli.doctor.doctor import Doctor, _verdict, launch_command
-from persist_cli.doctor.machine import GIB, Machine
+from persist_cli.doctor.machine import GIB, Machine, machine_of
 from persist_cli.doctor.memory_estimate import Launch
 from persist_cli.doctor.meta_model import MetaModel, build_meta_model
 from persist_cli.doctor.step import Encoding, ShallowCopies, StepKind
@@ -354,3 +355,12 @@ def test_savings_are_counted_without_the_compiler_that_the_training_needs(monkey
     monkeypatch.delenv("CXX", raising=False)
     doctor = Doctor(micro_meta_model("training.compile=true"), Machine("cuda", 1, GIB), sharded=False)
     assert doctor.not_considered == {}
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="the machine is then its GPU")
+def test_the_memory_of_this_machine_is_known_without_what_windows_lacks(monkeypatch):
+    whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    monkeypatch.delattr(os, "sysconf")
+    machine = machine_of(None, None)
+    assert (machine.kind, machine.devices) == ("cpu", 1)
+    assert machine.memory == pytest.approx(whole, rel=0.01)
