@@ -35,7 +35,8 @@ def bind(host: str, port: int) -> socket.socket:
         cause = error.strerror if isinstance(error, OSError) else "no valid name"
         raise PersistError(f"--host {host}: {cause}; give an address of this machine") from error
     try:
-        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if sys.platform != "win32":  # where it would let two servers take one port
+            bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         bound.bind(address)
         bound.listen()  # else another one that does not listen yet could bind the same port
     except OSError as error:

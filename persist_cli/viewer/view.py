@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -112,7 +113,8 @@ def serve_page(plan: ViewPlan, subject: Subject, address: Address, as_json: bool
                 say(f"Save replaces {session.out}; --out names another file")
             if address.opens and not as_json:
                 threading.Thread(target=open_browser, args=(url,), daemon=True).start()
-            threading.Event().wait()
+            while True:  # Ctrl-C ends no wait without a timeout on Windows
+                time.sleep(3600.0)
         except KeyboardInterrupt:
             try:
                 page.end()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import socket
+import sys
 import threading
 
 import pytest
@@ -63,6 +64,13 @@ def test_a_port_that_is_taken_is_said_before_the_model_is_loaded(persist, tmp_pa
         ended = persist("play", tmp_path / "no-model", "--port", port, "--no-open")
     assert ended.code == 1
     assert f"127.0.0.1:{port}: Address already in use" in ended.err
+
+
+@pytest.mark.parametrize(("system", "shared"), [("linux", True), ("win32", False)])
+def test_a_port_is_taken_over_from_a_server_that_has_ended_but_shared_with_none(system, shared, monkeypatch):
+    monkeypatch.setattr(sys, "platform", system)
+    with bind("127.0.0.1", 0) as bound:
+        assert bool(bound.getsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR)) == shared
 
 
 def test_the_address_is_one_that_a_browser_of_this_machine_finds():

@@ -6,10 +6,12 @@ import socket
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import pytest
 
 from persist_cli.memorize.memory_file import load_memory
+from persist_cli.viewer import view
 from persist_cli.viewer.edit_session import EditSession
 from persist_cli.viewer.view import say_unsaved
 from tests.support.play_pages import PATIENCE, until
@@ -56,6 +58,15 @@ def test_ctrl_c_ends_it_without_an_error(walks, tmp_path):
     finally:
         process.kill()
     assert (process.returncode, complaints) == (0, "")
+
+
+def test_it_waits_in_sleep_which_ctrl_c_ends_on_windows_too(persist, walks, monkeypatch):
+    def sleep(seconds: float) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(view, "time", SimpleNamespace(sleep=sleep))
+    ended = persist("view", f"{walks}#0:0-2", "--port", "0", "--json")
+    assert (ended.code, '"address"' in ended.out) == (0, True)
 
 
 def test_ctrl_c_while_the_model_is_loaded_ends_it_without_an_error(walks, voxel, tmp_path):
