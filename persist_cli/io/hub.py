@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
+from persist_cli.errors import PersistError
+
 TIMEOUT: Final = 3.0  # seconds
 
 MODEL_FILES: Final = ("config.json", "model.safetensors")
@@ -62,14 +64,24 @@ def without_bars() -> Iterator[None]:
 
 
 def weights_home() -> Path:
-    """The folder of all fetched weights: ``$PERSIST_CACHE/weights``, else a folder in the user's cache."""
+    """The folder of all fetched weights: ``$PERSIST_CACHE/weights``, else a folder in the user's cache.
+
+    Raises:
+        PersistError: when the user has no home folder, as a user of a container without a name.
+    """
     cache = os.environ.get("PERSIST_CACHE")
     if cache:
         return Path(cache) / "weights"
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "persist" / "weights"
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "persist" / "weights"
+    except RuntimeError as error:
+        raise PersistError("this user has no home folder to keep weights in; set PERSIST_CACHE to a folder") from error
 
 
 def cached_weight(name: str) -> Path | None:
     """The folder of weights by their name in ``persist weights list``, ``None`` when they are not fetched yet."""
-    folder = weights_home() / name
+    try:
+        folder = weights_home() / name
+    except PersistError:
+        return None
     return folder if (folder / "weight.json").is_file() else None

@@ -1,6 +1,7 @@
 """Weights of local files are verified, converted, and cached whole or not at all."""
 
 import json
+import os
 from dataclasses import replace
 
 import pytest
@@ -244,3 +245,12 @@ def test_sources_are_tried_in_the_order_directory_hub_package_index(directory, t
     assert message.index("directory") < message.index("hub someone/model") < message.index("of the package index")
     write_archive(weight, original(NAME), directory)
     fetch_weight(weight, directory, offline=True)
+
+
+def test_without_a_home_folder_no_weights_are_here_and_a_line_says_what_to_set(directory, monkeypatch):
+    for name in ("PERSIST_CACHE", "XDG_CACHE_HOME", "HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)  # as where the system knows no such user
+    assert cached_weight(NAME) is None
+    with pytest.raises(PersistError, match="no home folder to keep weights in; set PERSIST_CACHE"):
+        fetch_weight(weight_of(NAME, original(NAME), directory), directory, offline=True)
