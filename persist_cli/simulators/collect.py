@@ -204,9 +204,16 @@ def run_collect(plan: CollectPlan, out: Path, workers: int, json: bool) -> None:
     started = time.perf_counter()
     if missing:
         remove_leftovers(out, *(path.name for path in missing.values()))  # others may collect other scenes meanwhile
-        _collect_all(plan, missing, workers or os.cpu_count() or 1)
+        _collect_all(plan, missing, workers or usable_cores())
     seconds = time.perf_counter() - started
     _report(plan, out, len(paths), len(missing), seconds, json)
+
+
+def usable_cores() -> int:
+    """How many cores this process may use: those of a batch job may be few of the machine's."""
+    if hasattr(os, "sched_getaffinity"):  # not on macOS and Windows
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def claim_folder(plan: CollectPlan, out: Path) -> None:

@@ -21,7 +21,14 @@ from persist_cli.data.store import Store
 from persist_cli.errors import DataError, PersistError
 from persist_cli.navigation.ground_mapper import body_of
 from persist_cli.planning.true_futures import simulator_settings
-from persist_cli.simulators.collect import FIRST_SEED, SPLIT_SCENES, CollectPlan, claim_folder, run_collect
+from persist_cli.simulators.collect import (
+    FIRST_SEED,
+    SPLIT_SCENES,
+    CollectPlan,
+    claim_folder,
+    run_collect,
+    usable_cores,
+)
 from tests.support.miniworlds import make_world
 
 SMALL = CollectPlan(simulator="miniworld", scenes="0:3", frames=6, size="16x24")
@@ -279,3 +286,15 @@ def test_an_interrupt_ends_quietly_and_leaves_whole_files(tmp_path: Path) -> Non
     assert "Traceback" not in err
     assert all(trajectory.length == 12 for trajectory in Store(tmp_path))
     assert not list(tmp_path.glob(".partial-*"))
+
+
+def test_a_process_that_may_use_one_core_starts_one_worker(monkeypatch):
+    if hasattr(os, "sched_getaffinity"):
+        allowed = os.sched_getaffinity(0)
+        os.sched_setaffinity(0, {min(allowed)})
+        try:
+            assert usable_cores() == 1
+        finally:
+            os.sched_setaffinity(0, allowed)
+        monkeypatch.delattr(os, "sched_getaffinity")
+    assert usable_cores() == os.cpu_count()
