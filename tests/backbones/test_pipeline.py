@@ -253,6 +253,12 @@ def test_a_memory_is_refused_where_no_adapter_reads_it(changes):
         call(WorldPipeline.of(backbone), **PLAIN | changes)
 
 
+def test_a_device_without_float64_is_refused(monkeypatch):
+    monkeypatch.setattr(WorldPipeline, "_execution_device", torch.device("mps"))
+    with pytest.raises(PersistError, match=r"float64, which mps lacks; stay on the CPU: pipe\.to\('cpu'\)$"):
+        call(WorldPipeline.of(trained("projected")))
+
+
 def test_depth_that_is_not_finite_is_missing_and_whole_numbers_are_no_metres():
     depth = torch.full((2, 32, 32), 2.0)
     depth[:, 3], depth[:, 4], depth[:, 5] = torch.nan, torch.inf, -1.0

@@ -229,6 +229,8 @@ class WorldPipeline(OffloadingPipeline):
         return name
 
     def _check(self, sampling: Sampling, output_type: str, tensors: Sequence[str], remembers: bool) -> None:
+        if self._execution_device.type == "mps":
+            raise PersistError("cameras are computed in float64, which mps lacks; stay on the CPU: pipe.to('cpu')")
         self.backbone.check_sampling(sampling)
         if self.backbone.adapter is None and (remembers or sampling.memory_guidance != 1):
             raise PersistError("this model uses no memory adapter, which reads memory_tokens; load(…, adapter=NAME)")
