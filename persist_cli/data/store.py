@@ -207,7 +207,7 @@ class TrajectoryFile:
     @cached_property
     def _metadata(self) -> Any:
         with _parquet_errors(self.path):
-            metadata = pq.read_metadata(self.path)
+            metadata = pq.read_metadata(self.path.absolute())  # what begins with a name and a colon might be an address
         missing = set(COLUMNS.names) - set(metadata.schema.to_arrow_schema().names)
         if METADATA_KEY in (metadata.metadata or {}) and missing:
             raise DataError(f"{self.path}: its columns {', '.join(sorted(missing))} are missing")
@@ -265,7 +265,7 @@ class TrajectoryFile:
             return list(file.read(columns=[name], use_threads=False)[name].to_pylist())
 
     def _open(self) -> Any:
-        return pq.ParquetFile(self.path, metadata=self._metadata, page_checksum_verification=True)
+        return pq.ParquetFile(self.path.absolute(), metadata=self._metadata, page_checksum_verification=True)
 
     def _image(
         self, cell: dict[str, bytes], decode: Callable[[bytes], np.ndarray[Any, Any]], number: int
@@ -305,8 +305,9 @@ def write_trajectory(path: Path, info: TrajectoryInfo, frames: Iterable[Frame]) 
     form = schema(info, start.cells)
     rows = _checked_rows(path, info, itertools.chain([start], frames))
     poses: list[Tensor] = []
+    options = {"compression": "none", "use_dictionary": False, "write_page_checksum": True}
     with written_aside(path) as aside:
-        with pq.ParquetWriter(aside, form, compression="none", use_dictionary=False, write_page_checksum=True) as out:
+        with pq.ParquetWriter(aside.absolute(), form, **options) as out:
             while group := list(itertools.islice(rows, FRAMES_PER_GROUP)):
                 out.write_table(pa.Table.from_pylist(group, form))
                 poses += [torch.tensor(row["world_from_camera"], dtype=torch.float64).reshape(4, 4) for row in group]

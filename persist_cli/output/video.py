@@ -68,7 +68,7 @@ def write_video(path: Path, video: Iterable[UInt8[Tensor, "height width 3"]], fr
     """
     import av
 
-    with written_aside(path) as aside, av.open(str(aside), "w", format="mp4") as container:
+    with written_aside(path) as aside, av.open(str(aside.absolute()), "w", format="mp4") as container:
         stream = container.add_stream(
             "libx264", rate=Fraction(frames_per_second), options={"crf": "18", "preset": "veryfast"}
         )
@@ -102,7 +102,7 @@ def read_video(path: Path, height: int, width: int) -> UInt8[Tensor, "frame heig
     import av
 
     try:
-        with av.open(str(path)) as container:
+        with av.open(str(path.absolute())) as container:  # what begins with a name and a colon would be an address
             pictures = container.decode(video=0) if container.streams.video else ()
             frames = [picture.reformat(width, height, format="rgb24").to_ndarray() for picture in pictures]
     except (OSError, av.error.FFmpegError) as error:

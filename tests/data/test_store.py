@@ -230,6 +230,16 @@ def test_a_file_that_vanished_is_reported(path: Path) -> None:
         file.read()
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="no name has a colon there")
+def test_a_folder_whose_name_looks_like_an_address_is_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = Path("s3:runs/one.parquet")
+    with pytest.raises(DataError, match=r"^s3:runs/one\.parquet: no such file$"):
+        len(TrajectoryFile(path))
+    write_trajectory(path, INFO, make_frames())
+    assert len(TrajectoryFile(path).read().actions) == 20
+
+
 def test_a_missing_or_empty_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="nowhere: no such data set folder"):
         Store(tmp_path / "nowhere")

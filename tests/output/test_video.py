@@ -1,5 +1,8 @@
 """Videos and GIFs are read back nearly as they were written."""
 
+import sys
+from pathlib import Path
+
 import av
 import numpy as np
 import pytest
@@ -20,6 +23,13 @@ def test_a_video_is_read_back_with_the_codecs_losses_only(tmp_path):
     frames = read_video(tmp_path / "a.mp4", 64, 64)
     assert frames.shape == VIDEO.shape
     assert (frames.int() - VIDEO.int()).abs().float().mean() < 4
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no name has a colon there")
+def test_a_folder_whose_name_looks_like_an_address_is_a_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_video(Path("https:walk/a.mp4"), VIDEO)
+    assert read_video(Path("https:walk/a.mp4"), 64, 64).shape == VIDEO.shape
 
 
 def test_a_file_of_sound_alone_is_no_video(tmp_path):
