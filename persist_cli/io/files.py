@@ -245,8 +245,13 @@ def folder_aside(path: Path, age: float = 0.0) -> Iterator[Path]:
         yield aside
         if path.exists():  # a folder cannot be renamed over one that is not empty, so the old one is moved aside first
             with empty_folder_aside(path) as old:
-                path.rename(old / path.name)
-                aside.rename(path)
+                try:
+                    path.rename(old / path.name)
+                    aside.rename(path)
+                except BaseException:
+                    if not path.exists():
+                        (old / path.name).rename(path)
+                    raise
         else:
             aside.rename(path)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ntpath
 import os
 import stat
-from pathlib import PureWindowsPath
+from pathlib import Path, PureWindowsPath
 
 import pytest
 import torch
@@ -187,4 +187,24 @@ def test_a_folder_written_aside_replaces_the_old_one_only_when_it_is_whole(tmp_p
     with pytest.raises(FileNotFoundError), folder_aside(tmp_path / "m") as folder:
         (folder / "a.txt").rename(folder / "b.txt")
     assert (tmp_path / "m/a.txt").read_text() == "new"
+    assert [path.name for path in tmp_path.iterdir()] == ["m"]
+
+
+@pytest.mark.parametrize("failure", [PermissionError, KeyboardInterrupt])
+@pytest.mark.parametrize("place", [0, 1])
+def test_the_old_folder_stays_when_the_new_one_cannot_be_put_in_its_place(tmp_path, monkeypatch, failure, place):
+    with folder_aside(tmp_path / "m") as folder:
+        write_text(folder / "a.txt", "old")
+    renamed, targets = Path.rename, []
+
+    def rename(path: Path, target: Path) -> Path:
+        targets.append(target)
+        if len(targets) == place + 1:  # as on Windows, where a file in the folder is open, or by Ctrl-C
+            raise failure
+        return renamed(path, target)
+
+    monkeypatch.setattr(Path, "rename", rename)
+    with pytest.raises(failure), folder_aside(tmp_path / "m") as folder:
+        write_text(folder / "a.txt", "new")
+    assert (tmp_path / "m/a.txt").read_text() == "old"
     assert [path.name for path in tmp_path.iterdir()] == ["m"]
