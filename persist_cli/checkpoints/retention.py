@@ -84,6 +84,9 @@ def kept_checkpoints(run: Path, newest: int) -> list[KeptCheckpoint]:
 def remove_superseded(run: Path, newest: int) -> None:
     """Delete the checkpoints that a run does not keep; one that another run begins to stand on meanwhile stays.
 
+    So does one that cannot be moved away, as on Windows while somebody reads it: a line says so, and the next call
+    tries again.
+
     Args:
         run: the run's folder.
         newest: how many of the newest are kept without any other reason.
@@ -92,10 +95,18 @@ def remove_superseded(run: Path, newest: int) -> None:
     for step in step_folders(run):
         if step in kept:
             continue
-        with empty_folder_aside(step) as aside:
-            step.rename(aside / step.name)  # whoever begins on it now sees that it is gone
-            if _marks(step):
-                (aside / step.name).rename(step)
+        try:
+            _remove(step)
+        except OSError as error:
+            warn(f"{step}: is not needed any more, but cannot be removed now ({error.strerror})")
+
+
+def _remove(step: Path) -> None:
+    """Delete a checkpoint, unless another run begins to stand on it meanwhile."""
+    with empty_folder_aside(step) as aside:
+        step.rename(aside / step.name)  # whoever begins on it now sees that it is gone
+        if _marks(step):
+            (aside / step.name).rename(step)
 
 
 def ended_recipe(step: Path) -> bool:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+from pathlib import Path
 
 import pytest
 
@@ -46,6 +48,21 @@ def test_a_run_keeps_so_many_of_its_newest_checkpoints(here, newest, left):
     remove_superseded(run, newest)
     assert steps_of(run) == left
     assert [path.name for path in run.iterdir() if not path.name.startswith("step-")] == []
+
+
+def test_a_checkpoint_that_cannot_be_removed_ends_no_run_and_goes_later(here, monkeypatch, capsys):
+    run = write_steps(here / "run", 1, 2)
+
+    def rename(path: Path, target: Path) -> Path:
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", rename)
+        remove_superseded(run, 1)
+    assert steps_of(run) == [1, 2]
+    assert "cannot be removed now (Permission denied)" in capsys.readouterr().err
+    remove_superseded(run, 1)
+    assert [path.name for path in run.iterdir()] == ["step-00000002"]
 
 
 def test_a_checkpoint_that_ended_a_recipe_is_kept(here):
