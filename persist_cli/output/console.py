@@ -225,15 +225,19 @@ def busy(description: str, bar_of_its_own: bool = False) -> Iterator[None]:
 def print_json(value: Any) -> None:
     """Print a value as JSON on standard output; NaN and infinity become null.
 
-    Where its letters cannot be printed they are escaped, so that it stays JSON.
+    It is coloured on a terminal alone, whatever FORCE_COLOR says, for programs read it. Where its letters cannot be
+    printed they are escaped, so that it stays JSON.
     """
-    text = json.dumps(plain(value), allow_nan=False, ensure_ascii=False)
+    value = plain(value)
+    text = json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False)
     try:
         text.encode(OUT.encoding)
     except UnicodeEncodeError:
-        OUT.print_json(text, ensure_ascii=True)
+        text = json.dumps(value, indent=2, allow_nan=False)
+    if sys.stdout.isatty():
+        OUT.print_json(text, ensure_ascii=text.isascii())
     else:
-        OUT.print_json(text)
+        sys.stdout.write(f"{text}\n")
 
 
 def print_table(

@@ -36,6 +36,15 @@ def test_json_has_null_where_a_figure_is_not_defined(tmp_path, capsys):
         assert json.loads(text, parse_constant=pytest.fail) == PLAIN
 
 
+def test_json_has_no_colours_for_a_program_where_they_are_forced(capsys, monkeypatch):
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setattr(console, "OUT", Console())
+    print_json(FIGURES | {"name": "\N{GREEK SMALL LETTER MU} [b]"})
+    printed = capsys.readouterr().out
+    assert json.loads(printed) == PLAIN | {"name": "\N{GREEK SMALL LETTER MU} [b]"}
+    assert printed == json.dumps(json.loads(printed), indent=2, ensure_ascii=False) + "\n"
+
+
 @pytest.mark.parametrize("width", [60, 80, 100, 160])
 def test_a_table_cuts_no_number_or_name_in_a_terminal_of_any_width(width, capsys, monkeypatch):
     monkeypatch.setattr(console, "OUT", Console(width=width))
