@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import multiprocessing
 import signal
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import dataclass, field
+from multiprocessing import resource_tracker
 from pathlib import Path
 from types import FrameType
 from typing import Any, Generic, TypeVar, cast
@@ -59,6 +61,24 @@ def outlive_signals(_worker: int) -> None:
     """Let a process that reads data go on when all processes get a signal: the run ends it, after its checkpoint."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
+
+
+@contextmanager
+def held_back_signals() -> Iterator[None]:
+    """Within the block signals that stop a run wait, and never reach processes that begin in it anew, without a fork.
+
+    These take seconds until ``outlive_signals`` runs in them, and would end by a signal to all processes before. So
+    they do on Windows still, which cannot hold a signal back.
+    """
+    if multiprocessing.get_start_method() == "fork" or not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    resource_tracker.ensure_running()  # when it begins, it lets signals through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 class CaughtErrors(Dataset[Any]):
@@ -170,7 +190,8 @@ class TrainingLoop(ABC, Generic[Model]):
             worker_init_fn=outlive_signals,
             generator=torch.Generator(),  # of its own: the loader must not draw from the run's random state
         )
-        remaining = iter(loader)
+        with held_back_signals() if settings.workers else nullcontext():
+            remaining = iter(loader)
         try:
             while True:
                 with self.times.part("data"):

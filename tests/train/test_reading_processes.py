@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
+import signal
+import time
 from collections.abc import Iterator
 
 import pytest
 
+from persist_cli.train.training_loop import StopSignal, held_back_signals
 from tests.support.micro_policies import policy_stage
 from tests.support.micro_runs import equal_runs, stage
 
@@ -32,3 +36,21 @@ def test_samples_of_policies_are_those_that_are_read_in_the_training_itself(pers
         options = ["training.steps=2", f"training.workers={workers}"]
         assert persist(*policy_stage(walks, tmp_path / str(workers), *options)).code == 0
     assert equal_runs(tmp_path / "0", tmp_path / "1")
+
+
+def test_a_signal_to_all_processes_ends_none_that_still_begins():
+    with held_back_signals():
+        process = multiprocessing.Process(target=time.sleep, args=(0.1,))
+        process.start()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            os.kill(process.pid, number)
+    process.join()
+    assert process.exitcode == 0
+
+
+def test_a_signal_that_is_held_back_comes_later():
+    with StopSignal() as stop:
+        with held_back_signals():
+            os.kill(os.getpid(), signal.SIGINT)
+            assert stop.signal is None
+        assert stop.signal == signal.SIGINT
