@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Final
 
+from persist_cli.cli.options import print_any_letter
 from persist_cli.errors import INTERRUPTED, PersistError
 from persist_cli.output.console import say
 
@@ -28,6 +29,7 @@ def run_command(command: Sequence[str]) -> int:
 
 def run_main(main: Callable[[Sequence[str]], None]) -> None:
     """Run a program with the arguments of this process; an error ends it with one line and exit code 1."""
+    print_any_letter()
     try:
         main(sys.argv[1:])
     except PersistError as error:
