@@ -257,7 +257,7 @@ def folder_aside(path: Path, age: float = 0.0) -> Iterator[Path]:
 
 
 def remove_leftovers(folder: Path, *names: str, age: float = 0.0) -> None:
-    """Delete what killed writers left aside in ``folder``.
+    """Delete what killed writers left aside in ``folder``, as far as this user may.
 
     Args:
         folder: where they wrote.
@@ -271,7 +271,8 @@ def remove_leftovers(folder: Path, *names: str, age: float = 0.0) -> None:
         if leftover.is_dir():
             shutil.rmtree(leftover, ignore_errors=True)
         else:
-            leftover.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # another user's, in a folder that several share
+                leftover.unlink(missing_ok=True)
 
 
 def follow_umask(folder: Path) -> None:

@@ -113,8 +113,13 @@ class TensorCache:
         say(f"{self.folder}: {cause}; what is not in it is made anew each time")
 
     def _remove(self, path: Path, cause: str) -> None:
-        if path.is_file():  # another process may have removed it
+        if not path.is_file():  # another process may have removed it
+            return
+        try:
             path.unlink(missing_ok=True)
+        except OSError as error:
+            say(f"{cause}; not removed ({error.strerror}), made anew each time")
+        else:
             say(f"{cause}; removed, made anew")
 
 

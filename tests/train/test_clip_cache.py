@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from dataclasses import replace
@@ -309,6 +310,21 @@ def test_a_cache_may_be_unlimited_but_its_limit_must_be_a_number(tmp_path):
     assert len(entries(tmp_path)) == 1
     with pytest.raises(PersistError, match="--cache-gigabytes is nan"):
         TensorCache(CacheSettings(tmp_path, float("nan")))
+
+
+def test_what_another_user_left_in_a_shared_folder_ends_nothing(tmp_path, monkeypatch, capsys):
+    def unlink(path: Path, missing_ok: bool = False) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    TensorCache(CacheSettings(tmp_path, 1)).put("0" * 40, TOKENS)
+    entry = entries(tmp_path)[0]
+    entry.write_bytes(entry.read_bytes()[:-1])
+    leftover = entry.with_name(f"{ASIDE}0-x.safetensors")
+    leftover.touch()
+    os.utime(leftover, times=(0, 0))
+    monkeypatch.setattr(Path, "unlink", unlink)
+    assert TensorCache(CacheSettings(tmp_path, 1)).get("0" * 40) is None
+    assert "not removed (Permission denied), made anew each time" in capsys.readouterr().out
 
 
 def test_a_damaged_entry_is_removed_with_one_line_and_made_anew(persist, walks, codec, tmp_path):
