@@ -35,6 +35,7 @@ from persist_cli.cli.options import (
     TurnOption,
     VerifyOption,
     limit_spinning,
+    open_closed_streams,
     print_any_letter,
     refuse_other_options,
     show_version,
@@ -74,6 +75,7 @@ def main(arguments: list[str] | None = None) -> None:
     Where the environment sets PERSIST_TRACEBACK, the traceback of that error is printed before.
     """
     limit_spinning(os.environ)
+    open_closed_streams()
     print_any_letter()
     try:
         commands()(args=arguments)

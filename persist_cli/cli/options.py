@@ -6,6 +6,7 @@ import codecs
 import contextlib
 import errno
 import io
+import os
 import signal
 import sys
 import threading
@@ -205,6 +206,13 @@ def limit_spinning(environment: MutableMapping[str, str]) -> None:
     """
     if not {"GOMP_SPINCOUNT", "OMP_WAIT_POLICY"} & environment.keys():
         environment["GOMP_SPINCOUNT"] = SPINS
+
+
+def open_closed_streams() -> None:
+    """Let what is printed go nowhere where the caller has closed standard output or error, as some services do."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115  it stays open
 
 
 def print_any_letter() -> None:

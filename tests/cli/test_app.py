@@ -223,3 +223,9 @@ def test_an_error_is_red_on_a_terminal_unless_the_user_wants_no_color(no_color, 
     with pytest.raises(SystemExit):
         main(["recipes", "none"])
     assert ("\x1b[31m" in terminal.getvalue()) == (not no_color)
+
+
+@pytest.mark.parametrize("closed", [">&-", "2>&-", ">&- 2>&-"])
+def test_a_command_works_where_nobody_hears_it(closed):
+    script = f'exec "$0" -m persist_cli recipes {closed}'
+    assert subprocess.run(["sh", "-c", script, sys.executable], capture_output=True, check=False).returncode == 0
