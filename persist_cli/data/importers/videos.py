@@ -55,7 +55,7 @@ class VideoFrames:
         import av
 
         try:
-            with av.open(str(self.path)) as container:
+            with av.open(str(self.path.absolute())) as container:
                 for stream in container.streams.video[:1]:
                     stream.thread_type = "AUTO"
                     yield from container.decode(stream)
