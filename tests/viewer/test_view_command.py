@@ -64,9 +64,11 @@ def test_it_waits_in_sleep_which_ctrl_c_ends_on_windows_too(persist, walks, monk
     def sleep(seconds: float) -> None:
         raise KeyboardInterrupt
 
+    left = []
     monkeypatch.setattr(view, "time", SimpleNamespace(sleep=sleep))
+    monkeypatch.setattr(view, "leave", lambda: left.append(True))  # it would end the tests too
     ended = persist("view", f"{walks}#0:0-2", "--port", "0", "--json")
-    assert (ended.code, '"address"' in ended.out) == (0, True)
+    assert (ended.code, '"address"' in ended.out, left) == (0, True, [True])
 
 
 def test_ctrl_c_while_the_model_is_loaded_ends_it_without_an_error(walks, voxel, tmp_path):
