@@ -65,10 +65,10 @@ def outlive_signals(_worker: int) -> None:
 
 @contextmanager
 def held_back_signals() -> Iterator[None]:
-    """Within the block signals that stop a run wait, and never reach processes that begin in it anew, without a fork.
+    """Within the block signals that stop a run never reach processes that begin in it anew, without a fork.
 
-    These take seconds until ``outlive_signals`` runs in them, and would end by a signal to all processes before. So
-    they do on Windows still, which cannot hold a signal back.
+    The thread holds them back, and so do processes that it begins. These take seconds until ``outlive_signals`` runs in
+    them, and would end by a signal to all processes before. So they do on Windows still, which cannot hold one back.
     """
     if multiprocessing.get_start_method() == "fork" or not hasattr(signal, "pthread_sigmask"):
         yield
