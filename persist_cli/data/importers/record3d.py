@@ -64,7 +64,7 @@ class Archive:
 
     Args:
         path: the file.
-        unpack: undoes LZFSE.
+        unpack: undoes LZFSE; ``ValueError`` for damaged bytes.
 
     Raises:
         DataError: when it is no ZIP archive.
@@ -104,10 +104,8 @@ class Archive:
         packed = self.read(name)
         try:
             return np.frombuffer(self.unpack(packed), dtype=kind).reshape(size)
-        except Exception as error:  # lzfse raises an exception of its own, or MemoryError, for damaged bytes
-            raise DataError(
-                f"{self.path}: {name} does not unpack to {size[0]}×{size[1]} numbers ({error or type(error).__name__})"
-            ) from error
+        except ValueError as error:
+            raise DataError(f"{self.path}: {name} does not unpack to {size[0]}×{size[1]} numbers ({error})") from error
 
     def _depth(self, number: int, size: Size) -> Array:
         depth = self.numbers(f"rgbd/{number}.depth", np.float32, size)
@@ -197,9 +195,16 @@ def _pose(numbers: Any, where: str) -> Array | DataError:
 
 
 def _unpacker() -> Callable[[bytes], bytes]:
+    """What undoes LZFSE; it raises ``ValueError`` for damaged bytes."""
     try:
         import lzfse
     except ImportError as error:
         raise PersistError(f"record3d {NEEDED}") from error
-    unpack: Callable[[bytes], bytes] = lzfse.decompress
+
+    def unpack(packed: bytes) -> bytes:
+        try:
+            return lzfse.decompress(packed)  # type: ignore[no-any-return]
+        except (lzfse.error, MemoryError) as error:  # the latter where the end is cut off
+            raise ValueError("damaged, or not LZFSE") from error
+
     return unpack
