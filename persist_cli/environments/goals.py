@@ -6,9 +6,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Final
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from persist_cli.api.ground import GroundMap
@@ -27,6 +28,10 @@ ROOM = 3.0  # metres of unknown ground around all that is known, over which an a
 UNKNOWN = 1.0  # metres that a metre over unknown ground counts
 
 MOST_KEPT = 64  # goals whose distances are kept
+
+RANDOM: Final = "random"  # the goal of a setting that is free known ground
+
+SEEN: Final = "seen"  # and the one that is free ground which the start frames show
 
 Place = Float[Tensor, " 2"]  # on the ground axes, metres
 
@@ -91,11 +96,11 @@ class Goals:
 
 
 def find_goals(wanted: str | Sequence[float], free: Goals, observe: str) -> Goals:
-    """Return the goals of a setting: frames of a data set, a place in world metres, or ``random`` free ground.
+    """Return the goals of a setting: frames of a data set, a place in world metres, or free ground.
 
     Args:
         wanted: the setting.
-        free: the goals that ``random`` stands for.
+        free: the goals that ``random`` or ``seen`` stands for.
         observe: ``image`` where goals must have one.
 
     Raises:
@@ -106,7 +111,8 @@ def find_goals(wanted: str | Sequence[float], free: Goals, observe: str) -> Goal
             f"{wanted}: an image does not say where it was taken, from which the reward is measured; name a frame of a "
             "data set, as in runs/houses#0:40"
         )
-    if isinstance(wanted, str) and wanted != "random":
+    anywhere = wanted in (RANDOM, SEEN)
+    if isinstance(wanted, str) and not anywhere:
         frames = PosedFrames(wanted)
         frames.check_scene(free.scene)
         info, (height, width) = frames.info, free.size
@@ -115,10 +121,10 @@ def find_goals(wanted: str | Sequence[float], free: Goals, observe: str) -> Goal
         return replace(free, positions=frames.positions, frames=frames)
     if observe == "image":
         raise DataError(f"goal {wanted!r}: a place has no image; give observe_goal='place', or a frame of a data set")
-    if wanted == "random":
+    if anywhere:
         if not len(free.positions):
             raise DataError(
-                "goal 'random': no free ground is known; name frames of a data set, or give collide=True where the "
+                f"goal {wanted!r}: no free ground is known; name frames of a data set, or give collide=True where the "
                 "camera is some 1.25 m above the floor"
             )
         return free
@@ -163,6 +169,13 @@ class KnownGround:
         middles = (squares.flip(1) + 0.5) * self.ground.spacing + torch.tensor(self.ground.origin).double()
         height = (starts.double() @ self.ground.axes[2]).mean().expand(len(middles), 1)
         return torch.cat([middles, height], dim=1) @ self.ground.axes
+
+    def can_reach(
+        self, positions: Float[Tensor, "place 3"], starts: Float[Tensor, "start 3"]
+    ) -> Bool[Tensor, " place"]:
+        """Whether known free ground leads from any start to world positions."""
+        reached = distances_to(self.ground, self.ground.places(starts), self.radius)
+        return reached.at(self.ground.places(positions)).isfinite()
 
     def _distances(self, there: Place) -> Distances:
         key = tuple(there.tolist())

@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Float
+from torch import Tensor
 
 from persist_cli.api.checkpoint import REFERENCE, find_checkpoint
 from persist_cli.api.ground import GroundMap
@@ -17,7 +19,7 @@ from persist_cli.api.inference import SamplingOverrides
 from persist_cli.api.memory_file import is_memory_file
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.environments.environment import HouseEnv, HouseVectorEnv, Scenes
-from persist_cli.environments.goals import Goals, KnownGround, PosedFrames, find_goals
+from persist_cli.environments.goals import SEEN, Goals, KnownGround, PosedFrames, find_goals
 from persist_cli.environments.task import Attempt, TaskSettings, View
 from persist_cli.errors import CheckpointError, DataError
 from persist_cli.io.settings import parse_settings
@@ -38,7 +40,8 @@ class ImaginedSettings(TaskSettings):
 
     Args:
         start: frame of a data set, as in ``runs/houses#0:32``; of several, as in ``runs/houses#0:0-33``, one is drawn.
-        goal: frames of a data set, as for the start; ``[x, y, z]`` in world metres; or ``random``: free known ground.
+        goal: frames of a data set, as for the start; ``[x, y, z]`` in world metres; ``random``: free known ground; or
+            ``seen``: free ground that the start frames show, whatever else a memory file knows or imagined.
         checkpoint: a run, an export or ``reference``, the model that comes with the package.
         adapter: name of a memory adapter, by default the checkpoint's own; ``stage1`` for none.
         memory: a file of ``persist memorize``, or frames of a data set to make one of; ``None`` for an empty memory.
@@ -98,7 +101,7 @@ class ImaginedScenes(Scenes):
         if self.given is not None:
             memorize_frames(world, self.given)
         self.known = KnownGround(self._map(settings), body_of(info).radius, settings)
-        free = Goals(self.known.free_places(self.starts.positions), info.scene, (info.height, info.width))
+        free = Goals(self._free_places(settings), info.scene, (info.height, info.width))
         self.goals = find_goals(settings.goal, free, settings.observe_goal)
         if not isinstance(settings.goal, str):
             self._check_place()
@@ -165,20 +168,32 @@ class ImaginedScenes(Scenes):
         rows = zip(seen.rgb.cpu(), seen.depth.cpu(), poses, left.tolist(), free, strict=True)
         return [View(rgb.numpy(), depth.numpy(), pose.double().numpy(), m, was) for rgb, depth, pose, m, was in rows]
 
-    def _map(self, settings: ImaginedSettings) -> GroundMap:
+    def _free_places(self, settings: ImaginedSettings) -> Float[Tensor, "place 3"]:
+        """Where a goal without a name may lie, in world metres: on free known ground, and where it has to, seen."""
+        if settings.goal != SEEN:
+            return self.known.free_places(self.starts.positions)
+        seen = KnownGround(self._map(settings, remembered=False), self.known.radius, settings)
+        places = seen.free_places(self.starts.positions)
+        return places[self.known.can_reach(places, self.starts.positions)]
+
+    def _map(self, settings: ImaginedSettings, remembered: bool = True) -> GroundMap:
         """What is known of the ground: from the memory or the frames that it was made of, and the start frames.
 
         Nothing is known where the height of the camera is not; see ``knows_floor``.
+
+        Args:
+            settings: say which memory there is.
+            remembered: whether more is known than what the start frames show.
         """
         if not knows_floor(self.info, self.first.body):
             return GroundMap.empty(self.info.world_up)
         body = body_of(self.info)
         mapper = GroundMapper(self.info.world_up, body)
-        for frames in filter(None, [self.given, self.starts]):
+        for frames in filter(None, [self.given if remembered else None, self.starts]):
             for source in frames.sources:
                 for piece in source.pieces():
                     mapper.add(piece)
-        if settings.memory_file is not None and self.first.memory is not None:
+        if remembered and settings.memory_file is not None and self.first.memory is not None:
             mapper.add_memory(self.first.memory, mapper.floor_under(self.starts.positions.mean(0)))
         return mapper.map()
 

@@ -5,7 +5,8 @@ held-out houses and takes from it the one image that shows farthest. From this i
 that the scene model completes, and a voxel map. PPO learns in the Gymnasium environment of each, and in the true house
 as the ceiling, with equally many steps. It observes depth and the goal's place. How often it reaches its goals in the
 true house is measured before and after, by the same episodes. ``--images 24`` gives all images of the walk, at each of
-which an episode may start.
+which an episode may start. ``--goals seen`` lets agents practise in every house made of images with goals that these
+show; in a scene they may otherwise lie in rooms that it imagined.
 
 A scene may shut the agent in, so that no goal is far enough. Then nothing can be learned there, which is counted.
 
@@ -81,6 +82,8 @@ class Plan:
         episodes: in the true house, before and after.
         denoising_steps: of an imagined frame.
         images: of each house that are given: the one that shows farthest, or the first ones of the walk.
+        goals: of practice in a house made of images: ``random`` on all ground that is known or imagined, ``seen`` on
+            that which the images show.
     """
 
     out: Path
@@ -95,6 +98,7 @@ class Plan:
     episodes: int
     denoising_steps: int
     images: int = 1
+    goals: str = "random"
 
     @property
     def scenes(self) -> str:
@@ -169,7 +173,7 @@ def identity(plan: Plan) -> dict[str, Any]:
     described: dict[str, Any] = {
         "model": model_json(plan.model),
         "scenes": plan.scenes, "frames": FRAMES, "steps": plan.steps, "envs": plan.envs, "episodes": plan.episodes,
-        "denoising_steps": plan.denoising_steps, "images": plan.images,
+        "denoising_steps": plan.denoising_steps, "images": plan.images, "goals": plan.goals,
     }  # fmt: skip
     scenes = [memory for memory in plan.memories if memory != SIMULATOR and plan.draws_scenes(memory)]
     if scenes:
@@ -230,8 +234,9 @@ def practise(learning: Learning, image: str) -> dict[str, Any]:
         image: the frame, or frames, at which imagined episodes start.
 
     Returns:
-        The share of goals that it reaches in the true house ``before`` and ``after``, and ``without_goal``, why nothing
-        could be learned, ``None`` where it could.
+        The share of goals that it reaches in the true house ``before`` and ``after``, the share of the last episodes of
+        practice in which it came to its goal, ``practice``, and ``without_goal``, why nothing could be learned,
+        ``None`` where it could.
     """
     from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import VecMonitor
@@ -251,7 +256,8 @@ def practise(learning: Learning, image: str) -> dict[str, Any]:
         return {"before": before, "after": before, "without_goal": reason}
     policy.learn(plan.steps)
     after = success_rate(policy, true_house(house, TRUE_AGENTS), plan.episodes, MEASURED)
-    return {"before": before, "after": after, "without_goal": None}
+    practice = float(np.mean(policy.ep_success_buffer)) if policy.ep_success_buffer else None
+    return {"before": before, "after": after, "practice": practice, "without_goal": None}
 
 
 def missing_goal(envs: Any, seed: int) -> str | None:
@@ -272,7 +278,7 @@ def imagined_house(learning: Learning, image: str) -> Any:
     plan = learning.plan
     return gymnasium.make_vec(
         "persist/ImaginedHouse-v0", num_envs=plan.envs, checkpoint=plan.model, adapter=learning.memory, start=image,
-        memory=str(learning.memory_file), goal="random",
+        memory=str(learning.memory_file), goal=plan.goals,
         sampling={"steps": plan.denoising_steps, "memory_guidance": 1.0}, **TASK,
     )  # fmt: skip
 
@@ -358,6 +364,9 @@ def parse(arguments: Sequence[str]) -> Plan:
     parser.add_argument("--envs", type=int, default=8, help="agents that learn together")
     parser.add_argument("--episodes", type=int, default=100, help="in the true house, before and after")
     parser.add_argument("--images", type=int, default=1, help=f"given ones of each house, at most {FRAMES}")
+    parser.add_argument(
+        "--goals", choices=("random", "seen"), default="random", help="of practice in houses made of images"
+    )
     parser.add_argument("--denoising-steps", type=int, default=1, help="of an imagined frame")
     given = parser.parse_args(arguments)
     memories = [name.strip() for name in given.memories.split(",") if name.strip()]
@@ -369,7 +378,7 @@ def parse(arguments: Sequence[str]) -> Plan:
     return Plan(
         out=given.out, model=given.model, scene_model=given.scene_model, memories=memories, houses=given.houses,
         first=given.first, seeds=given.seeds, steps=given.steps, envs=given.envs, episodes=given.episodes,
-        denoising_steps=given.denoising_steps, images=given.images,
+        denoising_steps=given.denoising_steps, images=given.images, goals=given.goals,
     )  # fmt: skip
 
 

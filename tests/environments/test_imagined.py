@@ -187,7 +187,9 @@ def test_settings_that_do_not_go_together_are_one_line(settings, walks, tmp_path
             r"\(0.0, 1.3, 200.0\): \d+ m from all that is known",
         ),
         ({"goal": str(picture)}, "an image does not say where it was taken"),
-        ({"goal": "random", "observe_goal": "place"}, "no free ground is known"),  # the room tells no height
+        ({"goal": "random", "observe_goal": "place"}, "goal 'random': no free ground is known"),  # no height is told
+        ({"goal": "seen", "observe_goal": "place"}, "goal 'seen': no free ground is known"),
+        ({"goal": "seen"}, "a place has no image; give observe_goal='place'"),
         ({"adapter": "stage1"}, "without a memory adapter it cannot read"),
         ({"start": str(capture), "memory": None, "goal": str(capture)}, "have no motion of their own"),
         ({"memry": "m"}, "unknown key 'memry', did you mean 'memory'"),

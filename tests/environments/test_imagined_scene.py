@@ -33,3 +33,19 @@ def test_an_agent_can_walk_in_a_scene_that_was_made_of_one_image(
     seen, info = env.reset(seed=0)
     assert seen["rgb"].shape == (32, 32, 3)
     assert info["distance"] > 0.1
+
+
+def test_goals_may_be_kept_to_the_ground_that_the_image_shows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("PERSIST_REFERENCE", raising=False)
+    file = tmp_path / "house.safetensors"
+    run_persist("memorize", "sample#0:0", "--memory", "scene", "--complete", "--out", str(file))
+    ahead = {}
+    for goal in ("random", "seen"):
+        house = gymnasium.make(
+            "persist/ImaginedHouse-v0", memory=str(file), adapter="scene", start="sample#0:0", goal=goal,
+            observe_goal="place",
+        ).unwrapped.scenes  # fmt: skip
+        camera = house.starts.file.poses()[0].double()
+        ahead[goal] = (house.goals.positions - camera[:3, 3]) @ camera[:3, 2]
+    assert 0 < len(ahead["seen"]) < len(ahead["random"])
+    assert float(ahead["seen"].min()) > -0.5 > float(ahead["random"].min())
