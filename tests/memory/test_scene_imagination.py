@@ -8,6 +8,8 @@ from persist_cli.api.scene_edits import Remove
 from persist_cli.api.scene_model import SceneForm
 from persist_cli.errors import CheckpointError, DataError
 from persist_cli.memorize.memory_file import load_memory
+from persist_memory.scene import grid_scene
+from persist_memory.scene.imagination import sees_unknown
 from tests.support.cell_rooms import FORM, WALL, camera_at, cell_room
 from tests.support.drawn_scenes import SHAPE, DrawnWalls, empty_scene
 from tests.support.room_views import observe, room_walk
@@ -107,6 +109,24 @@ def test_what_a_path_will_see_is_imagined_once_and_always_the_same():
     scene.foresee([path])
     assert scene.cells is grown
     assert torch.equal(grown.classes, again.cells.classes)
+
+
+def test_rays_look_for_the_unknown_once_from_a_camera_until_the_cells_change(monkeypatch):
+    scene, looked = empty_scene(DrawnWalls()), []
+    scene.add(cell_room())
+    monkeypatch.setattr(grid_scene, "sees_unknown", lambda *given: looked.append(given) or sees_unknown(*given))
+    path = camera_at(cell_room(), (2, 3, 5), (9, 8, 2))
+    for one in (scene, scene, scene.copy()):
+        one.foresee([path])
+    assert len(looked) == 1
+    other = scene.copy()
+    other.edit([Remove(low=(0.0, 0.0, 0.0), high=(1.0, 1.0, 1.0))])
+    other.foresee([path])
+    assert len(looked) == 2
+    scene.foresee([path])
+    assert len(looked) == 2
+    scene.foresee([path.resized(path.height * 2, path.width * 2)])
+    assert len(looked) == 3
 
 
 def test_the_unknown_in_which_a_camera_stands_is_imagined_though_nothing_else_is_unknown():

@@ -45,6 +45,8 @@ from persist_memory.scene.interaction import LOAD, Load, Reached, changed_cells,
 from persist_memory.scene.settings import GridSceneSettings
 from persist_memory.validation import check_mergeable, check_observations, with_finite_depth
 
+MOST_FORESEEN = 10_000  # cameras that are kept of those that see nothing unknown
+
 
 class GridScene(Scene):
     """A dense grid of cells that grows, with the votes of observed frames, the newest view and what is carried.
@@ -80,6 +82,7 @@ class GridScene(Scene):
         self._load: Load | None = None
         self._store = self._empty_store()
         self._cells: CellGrid | None = None
+        self._foreseen: set[bytes] = set()  # cameras that see nothing unknown of these cells
 
     @property
     def cells(self) -> CellGrid:
@@ -125,7 +128,7 @@ class GridScene(Scene):
                 imagined = self._empty_store(frames.depth.device)
                 imagined.observe(votes)
                 self._fill(replace(imagined.box, origins=imagined.box.known.byte() * int(CellOrigin.IMAGINED)))
-            self._cells = None
+            self._changed()
 
     def add(self, cells: CellGrid) -> None:
         """Add the known cells of a grid, by the rule of origins; of equal origins the added one stays.
@@ -143,7 +146,7 @@ class GridScene(Scene):
         if not torch.allclose(cells.axes.cpu(), self._axes, atol=1e-6):
             raise DataError(f"memory {self.name!r}: the axes of the cells are not those of this scene; up differs")
         self._store.put(cells)
-        self._cells = None
+        self._changed()
 
     def foresee(self, cameras: Sequence[Cameras]) -> None:
         """Imagine what camera paths will see of unknown cells, up to ``foresight``, if this scene has a model.
@@ -254,7 +257,7 @@ class GridScene(Scene):
     def copy(self) -> Self:
         """Return a scene of the same cells, with the same model; changing one of the two does not change the other."""
         copy = type(self)(self.settings, self.encoder, self.reference)
-        copy._store, copy._cells = self._store.copy(), self._cells
+        copy._store, copy._cells, copy._foreseen = self._store.copy(), self._cells, self._foreseen
         copy._view, copy._load, copy._open_model = self._view, self._load, self._open_model
         return copy
 
@@ -276,7 +279,8 @@ class GridScene(Scene):
         if cells:
             check_cells(cells, len(self._form.palette), where)
             store.fill(cells)
-        self._store, self._cells, self._view, self._load = store, None, view, load
+        self._store, self._view, self._load = store, view, load
+        self._changed()
 
     def merge(self, other: Memory) -> None:
         """Add the cells of another scene: observed ones as if its frames had been written here.
@@ -294,7 +298,8 @@ class GridScene(Scene):
             self._store.merge(other._store)
         except DataError as error:
             raise CheckpointError(str(error)) from error
-        self._view, self._load, self._cells = self._view or other._view, self._load or other._load, None
+        self._view, self._load = self._view or other._view, self._load or other._load
+        self._changed()
 
     def points(self) -> MapPoints:
         """Return the middles of solid cells in their colours, with their ``CellOrigin``."""
@@ -366,21 +371,27 @@ class GridScene(Scene):
             self._store.reach(corner, [a + b for a, b in zip(corner, window.shape, strict=True)])
             self._store.replace(filled, chosen)
             self._store.name(filled, unnamed & (filled.classes != SOLID))
-            self._cells = None
+            self._changed()
         return int(chosen.sum())
+
+    def _changed(self) -> None:
+        """Forget what was found out about the cells before."""
+        self._cells, self._foreseen = None, set()  # another set, for copies may keep theirs
 
     def _foresee(self, path: Cameras) -> None:
         """Imagine windows around the cameras of a path until none sees an unknown cell."""
         imagination = self._imagination()
         _, [places] = distinct_cameras([path])
         for number, place in enumerate(places.tolist()):
-            if place in places[:number]:  # a clip repeats its last camera
-                continue
             camera = path[number : number + 1]
+            if place in places[:number] or _key(camera) in self._foreseen:  # a clip repeats its last camera
+                continue
             corner = imagination.around(self._number_at(camera.centers[0]))
             window = self._store.box.box(corner, imagination.model.form.shape)
             if sees_unknown(window, camera, self.settings.foresight, self.floor):
                 self._imagine(imagination, corner, self.settings.seed)
+            elif len(self._foreseen) < MOST_FORESEEN:
+                self._foreseen.add(_key(camera))
 
     def _act_by_model(self, action: Action, pose: Float[Tensor, "4 4"]) -> bool:
         """Let the scene model say what becomes of the cells in reach; false when it changes nothing."""
@@ -406,9 +417,15 @@ class GridScene(Scene):
         if self._view is not None and bool(gone.any()):
             self._view = self._view.without(before, gone)
         self._store.replace(after, changed_cells(before, after))
-        self._cells = None
+        self._changed()
 
     def _fill(self, cells: CellGrid) -> None:
         """Take over the known cells of a grid where nothing is known."""
         unknown = cells.known & ~self._store.box.box(cells.corner, cells.shape).known.to(cells.classes.device)
         self._store.replace(cells, unknown)
+
+
+def _key(camera: Cameras) -> bytes:
+    """A camera in bytes, of which another camera has others."""
+    parts = (camera.world_from_camera.double(), camera.intrinsics.double(), torch.tensor([camera.height, camera.width]))
+    return b"".join(part.numpy().tobytes() for part in parts)
