@@ -45,6 +45,7 @@ from persist_cli.cli.playing import playing_app
 from persist_cli.cli.scenes import scenes_app
 from persist_cli.cli.viewing import viewing_app
 from persist_cli.errors import TRACEBACK, PersistError
+from persist_cli.output.controls import without_controls
 
 app = typer.Typer(
     name="persist",
@@ -82,7 +83,7 @@ def main(arguments: list[str] | None = None) -> None:
     except PersistError as error:
         if os.environ.get(TRACEBACK):
             traceback.print_exc()
-        line = " ".join(str(error).split("\n"))  # a plugin's message may have several
+        line = without_controls(" ".join(str(error).split("\n")))  # a plugin's message may have several
         typer.secho(f"error: {line}", fg=None if os.environ.get("NO_COLOR") else typer.colors.RED, err=True)
         sys.exit(1)
 

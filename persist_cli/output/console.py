@@ -28,6 +28,7 @@ from rich.table import Table
 from rich.text import Text
 
 from persist_cli.io.files import plain
+from persist_cli.output.controls import without_controls
 
 Item = TypeVar("Item")
 
@@ -52,6 +53,21 @@ class RateColumn(ProgressColumn):
         rate = task.finished_speed or task.speed
         unit = task.fields.get("unit", "")
         return Text("" if rate is None else f"{rate:.3g} {unit}/s", style="progress.data.speed")
+
+
+class WordsColumn(TextColumn):
+    """A column of a progress bar with words as they are, but for control characters.
+
+    Args:
+        words: a form of the task's description or fields.
+    """
+
+    def __init__(self, words: str) -> None:
+        super().__init__(words, markup=False)
+
+    def render(self, task: Task) -> Text:
+        """The words as text."""
+        return Text(without_controls(super().render(task).plain))
 
 
 class ProgressLines(Progress):
@@ -120,8 +136,7 @@ class ProgressLines(Progress):
     def _write(self, line: str) -> None:
         self.due = self.get_time() + LINE_EVERY
         if not self.disable:
-            printable = "".join(letter if letter.isprintable() else "?" for letter in line)
-            sys.stderr.write(printable + "\n")
+            sys.stderr.write(without_controls(line).replace("\n", "?") + "\n")
             sys.stderr.flush()
 
 
@@ -170,12 +185,12 @@ def progress() -> Progress:
         lines.disable = not main
         return lines
     return Progress(
-        TextColumn("{task.description}", markup=False),
+        WordsColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
         RateColumn(),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}", markup=False),
+        WordsColumn("{task.fields[note]}"),
         console=PROGRESS,
         transient=True,
         disable=not main,
@@ -217,7 +232,7 @@ def busy(description: str, bar_of_its_own: bool = False) -> Iterator[None]:
         if not isinstance(bar, ProgressLines):
             if bar_of_its_own:
                 bar.stop()
-            bar.columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
+            bar.columns = (SpinnerColumn(), WordsColumn("{task.description}"), TimeElapsedColumn())
         add_task(bar, description, None, "")
         yield
 
@@ -253,6 +268,8 @@ def print_table(
         rows: texts of each row.
         sections: numbers of the rows below which a line is drawn.
     """
+    title, columns = without_controls(title), [without_controls(column) for column in columns]
+    rows = [[without_controls(text) for text in row] for row in rows]
     texts = [[column, *(row[number] for row in rows)] for number, column in enumerate(columns)]
     full_widths = [max(len(line) for text in column for line in text.split("\n")) for column in texts]
     word_widths = [max(len(word) for text in column for word in (*text.split(), "")) for column in texts]
@@ -274,12 +291,12 @@ def print_table(
 
 def say(text: str) -> None:
     """Print text for people on standard output as it is, brackets and long lines too."""
-    OUT.print(text, markup=False, emoji=False, highlight=False, soft_wrap=True)
+    OUT.print(without_controls(text), markup=False, emoji=False, highlight=False, soft_wrap=True)
 
 
 def warn(text: str) -> None:
     """Print one line for people on standard error, apart from the results on standard output."""
-    PROGRESS.print(text, markup=False, emoji=False, highlight=False, soft_wrap=True)
+    PROGRESS.print(without_controls(text), markup=False, emoji=False, highlight=False, soft_wrap=True)
 
 
 def _columns_by_table(least_widths: Sequence[int], terminal_width: int) -> Iterator[list[int]]:

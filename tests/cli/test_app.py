@@ -221,8 +221,9 @@ def test_an_error_is_red_on_a_terminal_unless_the_user_wants_no_color(no_color, 
     monkeypatch.setenv("NO_COLOR", no_color)
     monkeypatch.setattr(sys, "stderr", terminal)
     with pytest.raises(SystemExit):
-        main(["recipes", "none"])
+        main(["recipes", "none\x1b[2J"])
     assert ("\x1b[31m" in terminal.getvalue()) == (not no_color)
+    assert "\x1b[2J" not in terminal.getvalue()
 
 
 @pytest.mark.parametrize("closed", [">&-", "2>&-", ">&- 2>&-"])

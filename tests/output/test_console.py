@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import pytest
 from rich.console import Console
+from rich.progress import Progress
 
 from persist_cli.io.files import write_json
 from persist_cli.output import console
@@ -55,6 +56,26 @@ def test_a_table_cuts_no_number_or_name_in_a_terminal_of_any_width(width, capsys
     assert max(map(len, printed.splitlines())) <= width
     assert all(f" {cell} " in printed for cell in rows[0][:-1])
     assert all(word in printed for word in rows[0][-1].split())
+
+
+NAME = "a\x1b]0;title\x07\x1b[2Jb\r\x9b"  # sets a terminal's title and empties it
+
+
+def test_a_name_in_a_file_of_others_does_not_steer_the_terminal(capsys, monkeypatch):
+    terminal = {"force_terminal": True, "width": 120, "color_system": None}
+    monkeypatch.setattr(console, "OUT", Console(**terminal))
+    monkeypatch.setattr(console, "PROGRESS", Console(stderr=True, **terminal))
+    print_table(NAME, ["row", NAME], [[NAME, f"{NAME}\n1"]])
+    say(NAME)
+    warn(NAME)
+    bar = Progress(console=console.PROGRESS)
+    add_task(bar, NAME, 1, "frames", note=NAME)
+    words = [
+        console.WordsColumn(form).render(bar.tasks[0]).plain for form in ("{task.description}", "{task.fields[note]}")
+    ]
+    printed = capsys.readouterr()
+    assert not re.search(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]", printed.out + printed.err + "".join(words))
+    assert [text.count("a?]0;title??[2Jb??") for text in printed] == [5, 1]
 
 
 def test_brackets_and_colons_in_names_are_printed_as_they_are(capsys):
