@@ -19,6 +19,8 @@ MILLIMETRES = 1000.0  # in a metre
 FARTHEST = 65.535  # metres; 16 bits of millimetres hold no more
 COMPRESSION = 1  # of 9: a third of the time of the default for a few per cent more bytes
 SIZE = re.compile(r"^(?P<height>\d{1,9})x(?P<width>\d{1,9})$")
+STORED = ("PNG", "JPEG")  # formats of Pillow's in a trajectory's file
+FORMATS = (*STORED, "BMP", "PPM", "TIFF", "WEBP")  # in files of others; Pillow gives EPS to Ghostscript, which runs it
 LARGEST_SIDE = 4096  # pixels that can be asked for, of a simulator too
 
 Array = np.ndarray[Any, Any]
@@ -68,7 +70,7 @@ def decode_depth(data: bytes) -> Array:
 def _opened(data: bytes) -> Iterator[Image.Image]:
     """The image of some bytes; ``ValueError`` also for one that Pillow refuses to decode for its size."""
     try:
-        with Image.open(io.BytesIO(data)) as image:
+        with Image.open(io.BytesIO(data), formats=STORED) as image:
             yield image
     except Image.DecompressionBombError as error:
         raise ValueError(str(error)) from error

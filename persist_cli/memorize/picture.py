@@ -14,7 +14,7 @@ import numpy as np
 from persist_cli.api.actions import walking_actions
 from persist_cli.api.ground import Body
 from persist_cli.api.observations import Frame, TrajectoryInfo
-from persist_cli.data.images import crop_resize
+from persist_cli.data.images import FORMATS, crop_resize
 from persist_cli.data.importers.readers import read_photo
 from persist_cli.data.store import SUFFIX, Store, write_trajectory
 from persist_cli.errors import DataError
@@ -100,9 +100,9 @@ def read_depth(path: Path) -> Array:
     broken = (EOFError, OSError, SyntaxError, ValueError, zipfile.BadZipFile, Image.DecompressionBombError)
     try:
         if path.suffix == ".npy":
-            values = np.load(path, allow_pickle=False)
+            values = np.load(path, mmap_mode="r", allow_pickle=False)  # a header may claim more than there is
         else:
-            with Image.open(path) as image:
+            with Image.open(path, formats=FORMATS) as image:
                 values = np.array(image)
     except FileNotFoundError as error:
         raise DataError(f"{path}: no such depth file") from error

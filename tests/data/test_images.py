@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -115,3 +117,17 @@ def test_a_colour_image_of_32_bit_numbers_is_refused(tmp_path: Path, read, kind)
     Image.fromarray(np.ones((4, 4), kind)).save(tmp_path / "deep.tif")
     with pytest.raises(DataError, match=r"deep\.tif: a colour image of 32-bit numbers; save it with 8 or 16 bits"):
         read(tmp_path / "deep.tif")
+
+
+@pytest.mark.parametrize("read", [read_color, read_photo, lambda path: decode_rgb(path.read_bytes())])
+def test_an_image_in_postscript_is_refused_and_not_run(
+    read: Callable[[Path], object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ghostscript = tmp_path / "gs"
+    ghostscript.write_text(f"#!/bin/sh\ntouch {tmp_path}/ran\n")
+    ghostscript.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    Image.new("RGB", (8, 8)).save(tmp_path / "image.png", "EPS")
+    with pytest.raises((DataError, OSError), match="cannot identify image file"):
+        read(tmp_path / "image.png")
+    assert not (tmp_path / "ran").exists()

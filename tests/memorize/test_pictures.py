@@ -234,6 +234,7 @@ def test_a_picture_is_cropped_and_resized_as_a_model_needs(hall, tmp_path, capsy
         (["--depth", "empty.npy"], "cannot be read as depth"),
         (["--depth", "several.npy"], "give a single array"),
         (["--depth", "torn.npy"], "cannot be read as depth"),
+        (["--depth", "boastful.npy"], "cannot be read as depth"),
         (["--depth", "hall.npy", "--fov", "200"], "between 10 and 150"),
         (["--depth", "hall.npy", "--depth-model", "some"], "not both"),
         (["--depth-model", "empty"], "no usable folder"),
@@ -254,6 +255,9 @@ def test_a_picture_that_cannot_become_a_scene_is_refused_in_one_line(
     np.savez(tmp_path / "several.npz", depth=np.ones((48, 64), np.float32))
     (tmp_path / "several.npz").rename(tmp_path / "several.npy")
     (tmp_path / "torn.npy").write_bytes((tmp_path / "several.npy").read_bytes()[:99])
+    boast = {"descr": "<f4", "fortran_order": False, "shape": (2**30, 2**20)}
+    with (tmp_path / "boastful.npy").open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, boast)
     (tmp_path / "empty.npy").touch()
     (tmp_path / "empty").mkdir()
     for name in ("hall.png", "hall.npy"):

@@ -14,6 +14,7 @@ import torch
 from PIL import Image, ImageOps
 
 from persist_cli.api.cameras import check_intrinsics
+from persist_cli.data.images import FORMATS
 from persist_cli.data.importers.lenses import Lens
 from persist_cli.errors import DataError
 
@@ -163,7 +164,7 @@ def _eight_bits(image: Image.Image, path: Path | str) -> np.ndarray[Any, Any]:
 def _read_image(file: Path | io.BytesIO, name: str = "") -> Image.Image:
     name = name or str(file)
     try:
-        with Image.open(file) as image:
+        with Image.open(file, formats=FORMATS) as image:
             image.load()
             return image
     except FileNotFoundError as error:
