@@ -16,6 +16,8 @@ from persist_cli.api.cells import CellGrid
 from persist_cli.api.observations import Frame, TrajectoryInfo
 from persist_cli.errors import DataError
 
+MOST_CELLS = 2**27  # of a scene's box: 671 MB of cells
+
 LONGEST = 60  # characters of a wrong value in a message
 
 
@@ -86,6 +88,8 @@ def check_frame(frame: Frame, info: TrajectoryInfo, where: str) -> None:
         raise DataError(f"{where}: its timestamp is {shown(frame.timestamp)}, not a finite number of seconds")
     if not (frame.cells is None or isinstance(frame.cells, CellGrid)):
         raise DataError(f"{where}: its cells are {shown(frame.cells)}, no CellGrid")
+    if frame.cells is not None and math.prod(frame.cells.shape) > MOST_CELLS:
+        raise DataError(f"{where}: its box has {math.prod(frame.cells.shape):,} cells, more than {MOST_CELLS:,}")
 
 
 def _array(frame: Frame, name: str, where: str) -> np.ndarray[Any, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import zlib
 from dataclasses import dataclass, replace
 from typing import Any
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from persist_cli.api.cells import COMMON, CellForm, CellGrid
 from persist_cli.api.ground import ground_axes
+from persist_cli.data.storable import MOST_CELLS
 
 Array = np.ndarray[Any, Any]
 BYTES = 5  # of a cell: class, origin, red, green, blue
@@ -47,6 +49,8 @@ class CellBox:
         """Return the box that ``to_json`` wrote; ``KeyError``, ``TypeError`` or ``ValueError`` when it is none."""
         form = CellForm(float(values["size"]), tuple(str(name) for name in values["palette"]))
         (a, b, c), (rows, columns, levels) = (tuple(int(n) for n in values[key]) for key in ("corner", "shape"))
+        if math.prod((rows, columns, levels)) > MOST_CELLS:
+            raise ValueError(f"a box of {rows}×{columns}×{levels} has more than {MOST_CELLS:,} cells")
         if form.size <= 0 or form.palette[: len(COMMON)] != COMMON or min(rows, columns, levels) < 1:
             raise ValueError(f"cells of {form.size:g} m in a box of {rows}×{columns}×{levels} are none")
         return CellBox(form, (a, b, c), (rows, columns, levels))
@@ -63,11 +67,14 @@ class CellBox:
         """
         if not parts or parts[0] is None:
             raise ValueError("there are none at the first frame")
-        whole = np.prod(self.shape)
-        rows = _inflate(parts[0], int(whole) * BYTES).reshape(BYTES, -1).T.copy()
+        whole = math.prod(self.shape)
+        content = _inflate(parts[0], whole * BYTES)
+        if len(content) < whole * BYTES:
+            raise ValueError(f"{len(content)} bytes are not the {whole * BYTES} of the box")
+        rows = content.reshape(BYTES, -1).T.copy()
         for part in parts[1:]:
             if part is not None:
-                cells, values = _decode_changes(part)
+                cells, values = _decode_changes(part, whole)
                 if len(cells) and not 0 <= int(cells.min()) <= int(cells.max()) < whole:
                     raise ValueError("a change lies outside of the box")
                 rows[cells] = values
@@ -108,8 +115,8 @@ def _rows(grid: CellGrid) -> UInt8[Tensor, "cell 5"]:
     return torch.cat(parts, dim=1)
 
 
-def _decode_changes(part: bytes) -> tuple[Array, Array]:
-    content = _inflate(part, None)
+def _decode_changes(part: bytes, most: int) -> tuple[Array, Array]:
+    content = _inflate(part, most * (BYTES + 4))
     count, rest = divmod(len(content), BYTES + 4)
     if rest:
         raise ValueError(f"a change of {len(content)} bytes is not whole")
@@ -117,11 +124,15 @@ def _decode_changes(part: bytes) -> tuple[Array, Array]:
     return cells, content[4 * count :].reshape(count, BYTES)
 
 
-def _inflate(part: bytes, size: int | None) -> Array:
+def _inflate(part: bytes, most: int) -> Array:
+    """The bytes of a part; ``ValueError`` when it is damaged, or would become more than ``most`` bytes."""
+    inflater = zlib.decompressobj()
     try:
-        content = np.frombuffer(zlib.decompress(part), np.uint8)
+        content = inflater.decompress(part, most + 1)  # 1: for 0 means that there is no limit
     except zlib.error as error:
         raise ValueError(str(error)) from error
-    if size is not None and len(content) != size:
-        raise ValueError(f"{len(content)} bytes are not the {size} of the box")
-    return content
+    if len(content) > most:
+        raise ValueError(f"they are more than the {most} bytes of the box")
+    if not inflater.eof:
+        raise ValueError("they are cut off")
+    return np.frombuffer(content, np.uint8)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +15,7 @@ import torch
 from persist_cli.api.cells import COMMON, CellForm, CellGrid
 from persist_cli.api.ground import ground_axes
 from persist_cli.data.store import FRAMES_PER_GROUP, TrajectoryFile, write_trajectory
+from persist_cli.data.stored_cells import CellBox
 from persist_cli.errors import DataError
 from tests.support.noise import INFO, make_frames
 
@@ -92,6 +95,8 @@ def test_cells_in_another_box_are_refused_and_nothing_is_written(tmp_path: Path)
     [
         ([None] * 20, "there are none at the first frame"),
         ([b"no cells"] + [None] * 19, "incorrect header check"),
+        ([zlib.compress(bytes(99))] + [None] * 19, "99 bytes are not the 120 of the box"),
+        ([zlib.compress(bytes(120))[:-1]] + [None] * 19, "cut off"),
     ],
 )
 def test_damaged_cells_are_one_line(path: Path, column: list[bytes | None], cause: str) -> None:
@@ -105,6 +110,28 @@ def test_a_damaged_change_is_one_line(path: Path) -> None:
     rewrite(path, [stored[0], stored[0], *[None] * 18])
     with pytest.raises(DataError, match="the cells of frame 1 are damaged"):
         TrajectoryFile(path).cells(1)
+
+
+def test_cells_that_would_fill_the_machine_are_refused_before_they_do(path: Path) -> None:
+    stored = pq.read_table(path, columns=["cells"])["cells"].to_pylist()
+    bomb = zlib.compress(bytes(2**28))
+    for column, bytes_of_a_cell in (([bomb, *[None] * 19], 5), ([stored[0], bomb, *[None] * 18], 9)):
+        rewrite(path, column)
+        tracemalloc.start()
+        with pytest.raises(DataError, match=f"more than the {24 * bytes_of_a_cell} bytes of the box"):
+            TrajectoryFile(path).cells(1)
+        assert tracemalloc.get_traced_memory()[1] < 2**26
+        tracemalloc.stop()
+
+
+def test_a_box_of_more_cells_than_can_be_stored_is_refused(tmp_path: Path) -> None:
+    form = FORM.to_json() | {"corner": [0, 0, 0]}
+    with pytest.raises(ValueError, match="has more than 134,217,728 cells"):
+        CellBox.from_json(form | {"shape": [2**32, 2**32, 1]})
+    large = torch.zeros(1, dtype=torch.uint8).expand(2**10, 2**10, 2**8)
+    grid = CellGrid(large, large[..., None].expand(*large.shape, 3), large, (0, 0, 0), FORM, grid_at(0).axes)
+    with pytest.raises(DataError, match="frame 0: its box has 268,435,456 cells, more than"):
+        write_trajectory(tmp_path / "one.parquet", INFO, [replace(make_frames(1)[0], cells=grid)])
 
 
 def test_a_lost_column_is_named(path: Path) -> None:
