@@ -20,6 +20,7 @@ FIELDS: Final[dict[str, type | tuple[type, ...]]] = {
     "world_up": list,
     "cells": int,
 }
+LARGEST: Final = 2**53  # of a number of a direction, which then is finite as float64
 LENGTH: Final = 8  # bytes of a safetensors file before its header, which is JSON
 
 
@@ -58,7 +59,7 @@ def _checked_header(metadata: dict[str, str], path: Path) -> dict[str, Any]:
         raise CheckpointError(f"{path}: a safetensors file, but no memory of persist (it has no 'persist' header)")
     try:
         header = json.loads(metadata["persist"])
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise CheckpointError(f"{path}: its header is damaged ({error})") from error
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise CheckpointError(f"{path}: written by persist, but not as a memory file")
@@ -74,4 +75,5 @@ def _checked_header(metadata: dict[str, str], path: Path) -> dict[str, Any]:
 
 
 def _is_direction(values: list[Any]) -> bool:
-    return len(values) == 3 and all(isinstance(value, int | float) for value in values) and any(values)
+    numbers = len(values) == 3 and all(type(value) in (int, float) and abs(value) < LARGEST for value in values)
+    return numbers and any(values)

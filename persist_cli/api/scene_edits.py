@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 Metres = Annotated[float, Field(allow_inf_nan=False)]
 Point = tuple[Metres, Metres, Metres]
+Length = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Shade = Annotated[int, Field(ge=0, le=255)]
 Colour = tuple[Shade, Shade, Shade]
 
@@ -44,7 +45,7 @@ class Insert(_Edit):
     edit: Literal["insert"] = "insert"
     kind: str
     at: tuple[Metres | None, Metres | None, Metres | None]
-    size: Point | None = None
+    size: tuple[Length, Length, Length] | None = None
     color: Colour | None = None
     overwrite: bool = False  # take the place of what is there, where it would else be an error
 

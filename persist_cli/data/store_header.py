@@ -80,7 +80,7 @@ def read_info(metadata: dict[bytes, bytes] | None, path: Path) -> TrajectoryInfo
             raise DataError(f"{path}: its header is damaged, the checksum is wrong; take a whole copy")
         info = _parse_header(header)
         check_info(info, str(path))
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise DataError(f"{path}: its header is damaged ({type(error).__name__}: {error})") from error
     return info
 

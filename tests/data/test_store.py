@@ -223,6 +223,13 @@ def test_a_newer_version_is_refused(path: Path) -> None:
         TrajectoryFile(path).read()
 
 
+@pytest.mark.parametrize("header", [b"[" * 100_000, b'{"format": "persist-trajectory", "version": 1, "height": 1e999}'])
+def test_a_header_that_cannot_be_read_is_one_line(path: Path, header: bytes) -> None:
+    pq.write_table(pq.read_table(path).replace_schema_metadata({b"persist": header}), path)
+    with pytest.raises(DataError, match=r"one\.parquet: its header is damaged"):
+        TrajectoryFile(path).read()
+
+
 def test_a_file_that_vanished_is_reported(path: Path) -> None:
     file = TrajectoryFile(path)
     path.unlink()

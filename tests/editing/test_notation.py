@@ -78,6 +78,7 @@ def test_what_cannot_be_read_is_named_in_one_line(option, values, words):
         ('[{"edit": "remove", "low": [0, 0, 0], "high": [1, 1, 1]}, {"edit": "melt"}]', "edit 2: "),
         ('[{"edit": "remove", "low": [0, 0, 0]}]', "edit 1: high: Field required"),
         ('[{"edit": "paint", "low": [0, 0, 0], "high": [1, 1, 1], "color": [0, 0, 300]}]', "edit 1: color.2: "),
+        ('[{"edit": "insert", "kind": "box", "at": [0, 0, 0], "size": [1, -1, 1]}]', "edit 1: size.1: "),
     ],
 )
 def test_a_damaged_file_of_edits_says_which_edit_is_wrong(tmp_path, text, words):

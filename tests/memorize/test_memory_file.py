@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 
 import pytest
 import torch
@@ -84,6 +85,8 @@ def test_a_missing_file_and_a_foreign_file_have_different_errors(tmp_path):
         ({"format": "persist-checkpoint"}, "not as a memory file"),
         ({"version": 99}, "of version 99"),
         ({"world_up": [0, 0, 0]}, "header is damaged .see world_up"),
+        ({"world_up": [0, math.nan, 1]}, "header is damaged .see world_up"),
+        ({"world_up": [0, 10**400, 1]}, "header is damaged .see world_up"),
         ({"channels": None}, "header is damaged .see channels"),
         ({"channels": 16}, "written with 16 channels"),
         ({"cells": 3}, "the header says 3; the file is damaged, or restore"),
@@ -98,6 +101,12 @@ def test_a_header_that_does_not_fit_is_refused_in_one_line_naming_the_file(saved
         load_memory(with_header(saved, **changes))
     assert str(caught.value).startswith(str(saved))
     assert "\n" not in str(caught.value)
+
+
+def test_a_header_nested_too_deeply_is_refused_in_one_line(tmp_path):
+    save_file({"weight": torch.zeros(3)}, tmp_path / "m.safetensors", {"persist": "[" * 100_000})
+    with pytest.raises(CheckpointError, match=r"m\.safetensors: its header is damaged"):
+        load_memory(tmp_path / "m.safetensors")
 
 
 @pytest.mark.parametrize("name", MEMORIES)

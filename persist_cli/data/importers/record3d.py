@@ -11,6 +11,7 @@ Depth of the lowest confidence is left out. So its author describes the format, 
 from __future__ import annotations
 
 import json
+import math
 import os
 import zipfile
 import zlib
@@ -36,6 +37,8 @@ from persist_cli.errors import DataError, PersistError
 SUFFIX: Final = ".r3d"
 METADATA: Final = "metadata"
 FRAMES_PER_SECOND: Final = 30.0  # where the file does not say
+LARGEST: Final = 1 << 28  # bytes of a member: ten hours of poses
+SLACK: Final = 1 << 12  # bytes by which packing may make numbers longer
 NEEDED: Final = "needs the package lzfse: pip install 'persist-cli[record3d]'"
 
 
@@ -82,9 +85,11 @@ class Archive:
         return name in self._names
 
     def read(self, name: str) -> bytes:
-        """The bytes of a member; ``DataError`` when it is missing or damaged."""
+        """The bytes of a member; ``DataError`` when it is missing, damaged, or too large to be one of a recording."""
         if name not in self:
             raise DataError(f"{self.path}: no {name} in it")
+        if (size := self._zip.getinfo(name).file_size) > LARGEST:
+            raise DataError(f"{self.path}: {name} is damaged ({size:,} bytes, more than {LARGEST:,})")
         try:
             return self._zip.read(name)
         except (OSError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
@@ -102,6 +107,8 @@ class Archive:
     def numbers(self, name: str, kind: type[np.generic], size: Size) -> Array:
         """The numbers of a packed member, ``[height, width]``."""
         packed = self.read(name)
+        if len(packed) > math.prod(size) * np.dtype(kind).itemsize + SLACK:  # it could unpack to a thousand times that
+            raise DataError(f"{self.path}: {name} does not unpack to {size[0]}×{size[1]} numbers (it is larger itself)")
         try:
             return np.frombuffer(self.unpack(packed), dtype=kind).reshape(size)
         except ValueError as error:
@@ -156,7 +163,7 @@ def _metadata(archive: Archive, where: str) -> Mapping[str, Any]:
     """The values of the archive's JSON file, which has poses."""
     try:
         values = json.loads(archive.read(METADATA))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise DataError(f"{where}: not JSON ({error})") from error
     poses = values.get("poses") if isinstance(values, dict) else None
     if not isinstance(values, dict) or not isinstance(poses, list) or not poses:

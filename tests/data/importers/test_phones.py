@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import sys
 import zipfile
@@ -241,7 +242,7 @@ def replaced(path: Path, name: str, data: bytes | None) -> None:
     with zipfile.ZipFile(path) as archive:
         members = {member: archive.read(member) for member in archive.namelist()}
     members.pop(name)
-    with zipfile.ZipFile(path, "w") as archive:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for member, content in {**members, **({} if data is None else {name: data})}.items():
             archive.writestr(member, content)
 
@@ -264,6 +265,8 @@ def changed(**values: Any) -> Callable[[Path], None]:
         (lambda path: path.write_bytes(b"none"), "room.r3d: not a .r3d file, which is a ZIP archive"),
         (lambda path: replaced(path, "metadata", None), "room.r3d: no metadata in it"),
         (lambda path: replaced(path, "metadata", b"{"), "room.r3d: metadata: not JSON"),
+        (lambda path: replaced(path, "metadata", b"[" * 99999), "room.r3d: metadata: not JSON"),
+        (lambda path: replaced(path, "metadata", bytes(2**28 + 1)), "room.r3d: metadata is damaged"),
         (changed(poses=[]), "room.r3d: metadata: it has no poses"),
         (changed(h=None), "room.r3d: metadata: no h"),
         (changed(K=None, perFrameIntrinsicCoeffs=None), "room.r3d: metadata: no K"),
@@ -288,6 +291,7 @@ def test_a_broken_recording_is_one_line(tmp_path: Path, breaks: Callable[[Path],
         ("rgbd/2.jpg", b"none", "room.r3d: rgbd/2.jpg: not a whole image"),
         ("rgbd/2.depth", b"none", "room.r3d: rgbd/2.depth does not unpack to 48×64 numbers"),
         ("rgbd/2.depth", lzfse.compress(bytes(4000)), "room.r3d: rgbd/2.depth does not unpack to 48×64 numbers"),
+        ("rgbd/2.depth", lzfse.compress(os.urandom(48 * 64 * 4 + 9999)), "2.depth does not unpack .* larger itself"),
         ("rgbd/2.conf", lzfse.compress(bytes(40)), "room.r3d: rgbd/2.conf does not unpack to 48×64 numbers"),
     ],
 )
