@@ -17,6 +17,7 @@ from pydantic import BeforeValidator
 from persist_cli.api.stages import SCENE_STAGES, STAGES, Adversarial, Distill, Lora, Stage
 from persist_cli.errors import RecipeError, hint
 from persist_cli.io.settings import parse_settings
+from persist_cli.io.yaml_text import read_yaml
 from persist_cli.training_settings import CHANGEABLE, DataSettings, TrainingSettings
 
 EXTENDS: Final = "extends"
@@ -246,7 +247,7 @@ def parse_yaml_mapping(text: str, where: str) -> dict[str, Any]:
         RecipeError: one line that says where the text stops being YAML, or that it is no mapping.
     """
     try:
-        values = yaml.safe_load(text)
+        values = read_yaml(text)
     except (yaml.YAMLError, ValueError) as error:  # the latter for a date such as 2024-13-45
         raise RecipeError(f"{where}: not YAML ({' '.join(str(error).split())})") from error
     if not isinstance(values, dict):
@@ -294,7 +295,7 @@ def _read_override(override: str) -> tuple[str, Any]:
     if not equals or not key:
         raise RecipeError(f"cannot read {override!r}; write KEY=VALUE, as in training.steps=200")
     try:
-        return key, yaml.safe_load(text)
+        return key, read_yaml(text)
     except (yaml.YAMLError, ValueError) as error:
         raise RecipeError(f"cannot read the value in {override!r}") from error
 

@@ -15,6 +15,7 @@ from persist_cli.api.scene import Scene
 from persist_cli.checkpoints.load import adapter_memory
 from persist_cli.checkpoints.scene_models import packaged_scene_model, with_absolute_model
 from persist_cli.errors import CheckpointError, PersistError, RecipeError
+from persist_cli.io.yaml_text import read_yaml
 from persist_cli.plugins import load_plugin
 from persist_cli.recipe import MemoryConfig
 
@@ -156,7 +157,7 @@ def plugin_settings(texts: Sequence[str], kinds: Sequence[str] = ("memory", "enc
         if not (equals and dot and name) or kind not in settings:
             raise RecipeError(f"cannot read setting {text!r}; write {forms}")
         try:
-            settings[kind][name] = yaml.safe_load(value)
+            settings[kind][name] = read_yaml(value)
         except (yaml.YAMLError, ValueError) as error:  # the latter for a date such as 2024-13-45
             raise RecipeError(f"cannot read the value of {text!r}: {str(error).splitlines()[0]}") from error
     return settings
