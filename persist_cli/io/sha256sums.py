@@ -12,6 +12,7 @@ from typing import Final
 
 from persist_cli.errors import CheckpointError
 from persist_cli.io.checksums import is_verified
+from persist_cli.io.command_line import quoted
 from persist_cli.io.files import file_sha256, write_text, written_aside
 
 SUMS: Final = "SHA256SUMS"
@@ -104,8 +105,8 @@ def check_sums(folder: Path, wanted: Callable[[str], bool] = bool) -> None:
     unlisted = next((name for name in _unlisted(folder, sums) if wanted(name)), None)
     if unlisted is not None:
         raise CheckpointError(
-            f"{folder / unlisted}: not listed in {SUMS} beside it; if you added it: cd {folder} && "
-            f"sha256sum {unlisted} >> {SUMS}"
+            f"{folder / unlisted}: not listed in {SUMS} beside it; if you added it: cd {quoted(folder)} && "
+            f"sha256sum {quoted(unlisted)} >> {SUMS}"
         )
     hashes = hash_files(folder, (name for name in listed if is_verified(folder / name)))
     for name, sha256 in hashes.items():

@@ -167,7 +167,10 @@ def test_a_file_that_was_added_to_a_checkpoint_is_named_with_what_to_do(runs, tm
         PersistError, match=r"model_index\.json: not listed in SHA256SUMS.*sha256sum model_index\.json >>"
     ):
         find_checkpoint(folder)
-    (folder / "model_index.json").rename(folder / "notes.txt")  # other files are nobody's concern
+    (folder / "model_index.json").rename(folder / "a; b $(c).json")
+    with pytest.raises(PersistError, match=r"sha256sum 'a; b \$\(c\)\.json' >>"):  # it is there to be pasted
+        find_checkpoint(folder)
+    (folder / "a; b $(c).json").rename(folder / "notes.txt")  # other files are nobody's concern
     find_checkpoint(folder)
 
 

@@ -76,6 +76,13 @@ def test_more_channels_than_numbers_in_a_patch_are_refused():
         make_encoder("patches", {"patch": 2, "channels": 13})
 
 
+def test_a_large_patch_takes_no_more_than_its_channels_and_what_a_machine_cannot_hold_is_refused():
+    large = make_encoder("patches", {"patch": 400, "channels": 3})  # all its cosines would take 205 GB
+    assert large.encode(torch.zeros(1, 400, 800, 3, dtype=torch.uint8)).shape == (1, 1, 2, 3)
+    with pytest.raises(RecipeError, match="take a matrix of more than 67,108,864 numbers"):
+        make_encoder("patches", {"patch": 4000, "channels": 4000})
+
+
 def test_dinov2_gives_the_patch_tokens_of_the_last_block_after_the_layer_norm(tiny_dinov2):
     from transformers import Dinov2Model
 

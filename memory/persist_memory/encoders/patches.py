@@ -14,6 +14,7 @@ from persist_cli.api.encoder import Encoder
 from persist_cli.errors import RecipeError
 
 DETAIL_GAIN = 8.0  # brings detail to the order of colour; it is not whitened, so that noise stays small
+MOST = 2**26  # numbers of the matrix: 512 MB
 EXACT = 2.0**20  # weights are multiples of 1 / EXACT
 
 
@@ -49,6 +50,11 @@ class Patches(Encoder):
                 f"encoder {self.name!r}: {settings.channels} channels are more than the "
                 f"{3 * settings.patch**2} numbers of a patch of {settings.patch} pixels"
             )
+        if 3 * settings.patch**2 * settings.channels > MOST:
+            raise RecipeError(
+                f"encoder {self.name!r}: {settings.channels} channels of patches of {settings.patch} pixels take a "
+                f"matrix of more than {MOST:,} numbers; name smaller patches or fewer channels"
+            )
         self._weight = projection(settings)
 
     @property
@@ -72,7 +78,7 @@ class Patches(Encoder):
 
 def projection(settings: PatchesSettings) -> Float[Tensor, "value channel"]:
     """The matrix that turns the ``[row, column, rgb]`` values of a patch into its features, float64."""
-    coarse = _cosines(settings.patch)[:, : math.ceil(settings.channels / 3)]
+    coarse = _cosines(settings.patch, math.ceil(settings.channels / 3))
     basis = torch.einsum("pf,cd->pcfd", coarse, torch.eye(3, dtype=torch.float64))
     basis = basis.reshape(3 * settings.patch**2, -1)[:, : settings.channels]
     generator = torch.Generator().manual_seed(settings.seed)
@@ -83,14 +89,13 @@ def projection(settings: PatchesSettings) -> Float[Tensor, "value channel"]:
     return (basis * EXACT).round() / EXACT
 
 
-def _cosines(size: int) -> Float[Tensor, "pixel frequency"]:
-    """The two-dimensional cosine basis of a patch, coarsest first, scaled so that the first gives the mean."""
+def _cosines(size: int, count: int) -> Float[Tensor, "pixel frequency"]:
+    """The coarsest of the two-dimensional cosines of a patch, scaled so that the first gives the mean."""
     place = (torch.arange(size, dtype=torch.float64) + 0.5) * torch.pi / size
     frequency = torch.arange(size, dtype=torch.float64)
     line = torch.cos(place[:, None] * frequency) * torch.where(frequency > 0, math.sqrt(2), 1.0)
-    plane = torch.einsum("rf,cg->rcfg", line, line).reshape(size * size, size * size) / size**2
-    coarseness = (frequency[:, None] ** 2 + frequency**2).flatten()
-    return plane[:, coarseness.argsort(stable=True)]
+    chosen = (frequency[:, None] ** 2 + frequency**2).flatten().argsort(stable=True)[:count]
+    return (line[:, None, chosen // size] * line[None, :, chosen % size]).flatten(0, 1) / size**2
 
 
 def _whole_patches(rgb: Tensor, patch: int) -> Tensor:
