@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from persist_cli.output.console import busy
 
 ADVICE = "take one of metres, such as depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf"
 METRIC = ("zoedepth", "depth_pro")  # kinds whose models all give metres
+SAFE: Final = {"use_safetensors": True, "trust_remote_code": False}  # no pickles, and no code beside the weights
 Array = np.ndarray[Any, Any]
 
 
@@ -31,10 +32,10 @@ def estimate_depth(name: str, rgb: Array) -> Array:
 
     with busy("estimating depth"):
         try:
-            config = AutoConfig.from_pretrained(name)
-            processor = AutoImageProcessor.from_pretrained(name)
+            config = AutoConfig.from_pretrained(name, trust_remote_code=False)
+            processor = AutoImageProcessor.from_pretrained(name, trust_remote_code=False)
             check_metric(name, config)
-            model = AutoModelForDepthEstimation.from_pretrained(name, use_safetensors=True).eval()
+            model = AutoModelForDepthEstimation.from_pretrained(name, **SAFE).eval()
         except (OSError, ValueError, ImportError) as error:
             kind = "folder" if Path(name).is_dir() else "folder or model of the hub"
             raise DataError(f"--depth-model {name}: no usable {kind} ({str(error).strip().splitlines()[0]})") from error

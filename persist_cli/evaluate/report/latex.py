@@ -59,9 +59,14 @@ def latex_tables(results: EvalResults) -> str:
             groups = [(title, group) for title, group in groups if group]
             blocks.append(_float(view, groups, _difference, caption, f"{label}-differences"))
         if table.left_out:
-            blocks.append(f"% {left_out_line(table.left_out, commands=False)}\n")
-    warnings = [f"% warning: {line}\n" for line in contamination_lines(results)]
-    return HEAD + "\n".join([*warnings, f"% {new_poses_line(results)}\n", *blocks])
+            blocks.append(_comment(left_out_line(table.left_out, commands=False)))
+    warnings = [_comment(f"warning: {line}") for line in contamination_lines(results)]
+    return HEAD + "\n".join([*warnings, _comment(new_poses_line(results)), *blocks])
+
+
+def _comment(text: str) -> str:
+    """A comment of LaTeX; a name with a line end in it does not end it."""
+    return f"% {' '.join(text.split())}\n"
 
 
 def escape(text: str) -> str:

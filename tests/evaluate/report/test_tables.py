@@ -98,6 +98,14 @@ def test_captions_name_no_command():
     assert "persist weights" not in latex
 
 
+def test_a_line_end_in_a_name_does_not_end_a_comment_of_latex():
+    results = example_results()
+    results["checkpoints"][0]["training_scenes"] = {"known": 1, "complete": True, "evaluated": ["a\n\\input{b}"]}
+    latex = latex_tables(check_results(results, "example"))
+    [line] = [line for line in latex.splitlines() if "\\input{b}" in line]
+    assert line.startswith("% warning: ")
+
+
 @pytest.mark.parametrize("own_seeds", [1, 3])
 def test_the_caption_says_what_deviations_are_over(own_seeds):
     results = example_results()
