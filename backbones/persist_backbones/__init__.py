@@ -30,9 +30,11 @@ def load(
     Raises:
         PersistError: one line when there is no such checkpoint or adapter, or it is damaged.
     """
+    import torch
+
     from persist_backbones.pipeline.pipeline import load_pipeline  # diffusers takes seconds to import
 
-    with verifying(verify):
+    with verifying(verify), torch.random.fork_rng(devices=[]):  # parts are drawn before they are loaded
         return load_pipeline(Path(folder), adapter, dtype)
 
 

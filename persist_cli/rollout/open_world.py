@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from persist_cli.api.checkpoint import PLAIN, REFERENCE, Checkpoint, find_checkpoint
 from persist_cli.api.ground import Body
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
@@ -80,7 +82,8 @@ def open_world(
         start=start, memory=None if memory is None else Path(memory), adapter=adapter, seed=seed,
         sampling=sampling or SamplingOverrides(),
     )  # fmt: skip
-    world = assemble_world(found, found.chosen_adapter(adapter), options, frame.info)
+    with torch.random.fork_rng(devices=[]):  # parts are drawn before they are loaded
+        world = assemble_world(found, found.chosen_adapter(adapter), options, frame.info)
     world.reset([frame.observations], [frame.info])
     return world
 

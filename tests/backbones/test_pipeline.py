@@ -307,7 +307,10 @@ def checkpoints(tmp_path: Path) -> tuple[CogVideoX, Path, Path]:
 
 def test_one_call_makes_a_pipeline_of_a_checkpoint(checkpoints):
     backbone, base, stage2 = checkpoints
-    assert same(call(persist_backbones.load(stage2)), call(WorldPipeline.of(backbone)))
+    before = torch.get_rng_state()
+    loaded = persist_backbones.load(stage2)
+    assert torch.equal(torch.get_rng_state(), before)
+    assert same(call(loaded), call(WorldPipeline.of(backbone)))
     backbone.use_adapter(None)
     plain = call(WorldPipeline.of(backbone), **PLAIN)
     assert same(call(persist_backbones.load(base), **PLAIN), plain)

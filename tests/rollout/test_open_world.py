@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+import torch
 
 from persist_cli.api.ground import Body
 from persist_cli.api.inference import SamplingOverrides
@@ -45,6 +46,12 @@ def test_an_agent_has_a_body_where_the_data_tell_how_high_its_camera_is(voxel, w
     assert simulated.agents[0].body == Body()
     assert told.agents[0].body == Body(camera_height=1.3)
     assert told.agents[0].surroundings is not None
+
+
+def test_a_world_leaves_the_random_numbers_of_its_caller_alone(voxel, walks):
+    before = torch.get_rng_state()
+    open_world(f"{walks}#0:2", voxel, sampling=FAST).step([["left"]])
+    assert torch.equal(torch.get_rng_state(), before)
 
 
 def test_a_world_without_an_adapter_has_no_memory(voxel, walks):
