@@ -7,7 +7,6 @@ from collections.abc import Iterable
 from typing import Final
 
 INTERRUPTED: Final = 130  # exit code after Ctrl-C, which is the signal 2
-TERMINATED: Final = 143  # exit code after SIGTERM, which is the signal 15
 
 TRACEBACK: Final = "PERSIST_TRACEBACK"  # environment variable: print where an error comes from, too
 

@@ -36,6 +36,7 @@ from persist_cli.cli.options import (
     VerifyOption,
     limit_spinning,
     open_closed_streams,
+    outlive_listeners,
     print_any_letter,
     refuse_other_options,
     show_version,
@@ -77,6 +78,7 @@ def main(arguments: list[str] | None = None) -> None:
     """
     limit_spinning(os.environ)
     open_closed_streams()
+    outlive_listeners()
     print_any_letter()
     try:
         commands()(args=arguments)
@@ -198,7 +200,8 @@ def finetune(
 
     persist finetune tiny-stage1 --data runs/houses --out runs/stage1 training.steps=200
 
-    Exit codes: 0 after the last step; 130 after Ctrl-C and 143 after SIGTERM, saved to go on with --resume; 1 an error.
+    Exit codes: 0 after the last step; 130, 143 or 129 after Ctrl-C, SIGTERM or SIGHUP, saved to go on with
+    --resume; 1 an error.
     """
     if dry_run:
         from persist_cli.doctor.dry_run import run_dry_run

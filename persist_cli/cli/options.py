@@ -10,7 +10,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator, MutableMapping
+from collections.abc import Collection, Iterator, MutableMapping
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any, Final
@@ -19,9 +19,10 @@ import typer
 from typer.core import TyperGroup
 
 from persist_cli import __version__
-from persist_cli.errors import INTERRUPTED, TERMINATED, PersistError
+from persist_cli.errors import INTERRUPTED, PersistError
 from persist_cli.io.checksums import verifying
 from persist_cli.io.command_line import command_line
+from persist_cli.io.signals import STOPPING, caught_signals
 from persist_cli.plugins import plugin_errors
 
 DISK_ERRORS: Final = {  # of a disk that is full, closed or read-only, which is no fault of a command
@@ -215,6 +216,36 @@ def open_closed_streams() -> None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115  it stays open
 
 
+def outlive_listeners() -> None:
+    """Let a command go on when its terminal is closed, or when the program that reads its standard error has ended.
+
+    That may be before a training saves, as when Ctrl-C also ends ``tee``. Only where a program reads standard output is
+    its end that of the command, as in ``persist recipes | head``.
+    """
+    for name, unheard in (("stdout", (errno.EIO,)), ("stderr", (errno.EIO, errno.EPIPE))):
+        stream = getattr(sys, name)
+        if os.name == "posix" and isinstance(stream, io.TextIOWrapper) and stream is getattr(sys, f"__{name}__"):
+            buffer = io.BufferedWriter(_PerhapsUnheard(stream.fileno(), unheard))
+            heard = io.TextIOWrapper(buffer, stream.encoding, stream.errors, None, stream.line_buffering)
+            setattr(sys, name, heard)
+
+
+class _PerhapsUnheard(io.FileIO):
+    """A file that takes what is written as written when it refuses it with one of some errors."""
+
+    def __init__(self, number: int, errors: Collection[int]) -> None:
+        super().__init__(number, "w", closefd=False)
+        self.errors = errors
+
+    def write(self, data: Any) -> int:
+        try:
+            return super().write(data)
+        except OSError as error:
+            if error.errno not in self.errors:
+                raise
+            return len(data)
+
+
 def print_any_letter() -> None:
     """Let standard output show question marks for letters that its encoding lacks, and any file name as it is.
 
@@ -267,7 +298,7 @@ def show_version(show: bool) -> None:
 
 
 class Commands(TyperGroup):
-    """Commands that end in one line: Ctrl-C with exit code 130, SIGTERM with 143, files or bad plugins with 1."""
+    """Commands that end in one line: a signal with 128 and its number, as in a shell, files or bad plugins with 1."""
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
         """Read the words of the command line, and keep them for results that say how they were made."""
@@ -291,7 +322,7 @@ class Commands(TyperGroup):
             raise PersistError(f"{shown_name(error)}: holds letters that are not UTF-8; rename it") from error
         except KeyboardInterrupt as stop:
             typer.secho("stopped; what is written is whole, the same command goes on with it or begins anew", err=True)
-            raise typer.Exit(TERMINATED if isinstance(stop, Terminated) else INTERRUPTED) from None
+            raise typer.Exit(128 + stop.number if isinstance(stop, Terminated) else INTERRUPTED) from None
 
 
 def system_error(error: OSError) -> str:
@@ -311,21 +342,25 @@ def shown_name(error: UnicodeEncodeError) -> str:
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM, which ends a command like Ctrl-C: what it writes aside is removed and its processes are ended."""
+    """A signal that ends a command like Ctrl-C: what it writes aside is removed and its processes are ended.
+
+    Args:
+        number: the signal's.
+    """
+
+    def __init__(self, number: int) -> None:
+        self.number = number
 
 
 @contextlib.contextmanager
 def _terminated_like_interrupted() -> Iterator[None]:
-    """Within the block SIGTERM raises ``Terminated``, as Ctrl-C raises ``KeyboardInterrupt``."""
+    """Within the block SIGTERM and SIGHUP raise ``Terminated``, as Ctrl-C raises ``KeyboardInterrupt``."""
 
     def stop(number: int, frame: FrameType | None) -> None:
-        raise Terminated
+        raise Terminated(number)
 
     if threading.current_thread() is not threading.main_thread():  # no other may change what a signal does
         yield
         return
-    previous = signal.signal(signal.SIGTERM, stop)
-    try:
+    with caught_signals(stop, {*STOPPING} - {signal.SIGINT}):
         yield
-    finally:
-        signal.signal(signal.SIGTERM, previous)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import socket
 import sys
 import threading
@@ -15,6 +14,7 @@ from typing import Any, Final
 
 from persist_cli.io.files import check_folder
 from persist_cli.io.own_address import EVERYWHERE, address_of, bind, is_loopback, leave, names_of, open_browser
+from persist_cli.io.signals import caught_signals
 from persist_cli.output.console import print_json, say, warn
 from persist_cli.play.open_play import PlayOptions, open_walks
 from persist_cli.play.play import Play
@@ -97,20 +97,18 @@ def first_ready(walk: Callable[[], Play]) -> Callable[[], Play]:
 
 
 class StopSignals:
-    """Lets Ctrl-C and SIGTERM end a server; before there is one they raise ``KeyboardInterrupt``."""
+    """Lets signals that ask to stop end a server; before there is one they raise ``KeyboardInterrupt``."""
 
     def __init__(self) -> None:
         self._server: Server | None = None
-        self._previous: dict[int, Any] = {}
+        self._caught = caught_signals(self._stop)
 
     def __enter__(self) -> StopSignals:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            self._previous[number] = signal.signal(number, self._stop)
+        self._caught.__enter__()
         return self
 
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
+    def __exit__(self, *error: Any) -> None:
+        self._caught.__exit__(*error)
 
     def end(self, server: Server) -> None:
         """Let the signals end this server from now on."""

@@ -9,8 +9,9 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from persist_cli.cli.options import print_any_letter
+from persist_cli.cli.options import outlive_listeners, print_any_letter
 from persist_cli.errors import INTERRUPTED, PersistError
+from persist_cli.io.signals import caught_signals
 from persist_cli.output.console import say
 
 COLLECT: Final = "collect miniworld --size 64x64"
@@ -19,16 +20,14 @@ COLLECT: Final = "collect miniworld --size 64x64"
 def run_command(command: Sequence[str]) -> int:
     """Run a command and return its exit code; after Ctrl-C the command is given the time to end."""
     interrupts: list[int] = []
-    previous = signal.signal(signal.SIGINT, lambda number, _: interrupts.append(number))  # a child does not inherit it
-    try:
+    with caught_signals(lambda number, _: interrupts.append(number), [signal.SIGINT]):  # a child does not inherit it
         code = subprocess.run(command, check=False).returncode
-    finally:
-        signal.signal(signal.SIGINT, previous)
     return INTERRUPTED if interrupts else code
 
 
 def run_main(main: Callable[[Sequence[str]], None]) -> None:
     """Run a program with the arguments of this process; an error ends it with one line and exit code 1."""
+    outlive_listeners()
     print_any_letter()
     try:
         main(sys.argv[1:])

@@ -126,7 +126,7 @@ def run_finetune(plan: FinetunePlan) -> None:
         raise RecipeError(f"{plan.recipe}: no data set; give --data DIR")
     check_run(run, recipe, plan.resume)
     lost = explain_lost_processes(partial(last_checkpoint, run))
-    with StopSignal() as stop, limited_threads(recipe.training.threads), lost:
+    with StopSignal.awaited() as stop, limited_threads(recipe.training.threads), lost:
         ended_by = finetune(recipe, run, stop, plan)
     if ended_by is not None:
         sys.exit(128 + ended_by)  # as a shell says that a signal ended a command: it must not go on with the next

@@ -9,7 +9,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from pathlib import Path
 from types import FrameType
@@ -25,6 +25,7 @@ from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.checkpoints.lineage import Lineage
 from persist_cli.data.clips import DistributedBatches
 from persist_cli.errors import PersistError
+from persist_cli.io.signals import STOPPING, caught_signals
 from persist_cli.output.console import add_task, progress
 from persist_cli.recipe import Recipe
 from persist_cli.train.distributed import Sharding, ZeroState, is_sharded, unflattened, uses_zero
@@ -39,27 +40,26 @@ Model = TypeVar("Model", bound=nn.Module)
 
 @dataclass
 class StopSignal:
-    """Within the block, SIGINT and SIGTERM are noted here, so that a run can stop at the end of its step."""
+    """The signal that asked a run to stop, once there is one; the run stops at the end of its step."""
 
     signal: int | None = None
-    previous_handlers: dict[int, Any] = field(default_factory=dict)
 
-    def __enter__(self) -> StopSignal:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            self.previous_handlers[number] = signal.signal(number, self._note)
-        return self
+    @classmethod
+    @contextmanager
+    def awaited(cls) -> Iterator[StopSignal]:
+        """Within the block a signal that would end the process is noted instead."""
+        stop = cls()
 
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self.previous_handlers.items():
-            signal.signal(number, handler)
+        def note(number: int, _frame: FrameType | None) -> None:
+            stop.signal = number
 
-    def _note(self, number: int, _frame: FrameType | None) -> None:
-        self.signal = number
+        with caught_signals(note):
+            yield stop
 
 
 def outlive_signals(_worker: int) -> None:
     """Let a process that reads data go on when all processes get a signal: the run ends it, after its checkpoint."""
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in STOPPING:
         signal.signal(number, signal.SIG_IGN)
 
 
@@ -74,7 +74,7 @@ def held_back_signals() -> Iterator[None]:
         yield
         return
     resource_tracker.ensure_running()  # when it begins, it lets signals through again
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)
     try:
         yield
     finally:

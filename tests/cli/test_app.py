@@ -17,6 +17,7 @@ import typer
 from persist_cli.cli.app import main
 from persist_cli.cli.options import Commands, print_any_letter
 from persist_cli.io.command_line import running_command
+from persist_cli.io.signals import STOPPING
 from persist_cli.output.console import print_json, say
 from tests.support.disk import file_limit
 from tests.support.micro_runs import MICRO_SETTINGS, stage
@@ -113,15 +114,16 @@ def test_a_file_in_the_place_of_an_output_folder_is_reported_before_any_work(per
     assert len(ended.err.strip().splitlines()) == 1
 
 
-def test_sigterm_ends_a_command_in_one_line_with_the_exit_code_of_that_signal(persist, monkeypatch):
-    monkeypatch.setattr("persist_cli.output.listings.show_recipes", lambda _: signal.raise_signal(signal.SIGTERM))
-    before = signal.getsignal(signal.SIGTERM)
+@pytest.mark.parametrize("sent", STOPPING[1:])
+def test_a_signal_ends_a_command_in_one_line_with_the_exit_code_of_that_signal(persist, monkeypatch, sent):
+    monkeypatch.setattr("persist_cli.output.listings.show_recipes", lambda _: signal.raise_signal(sent))
+    before = signal.getsignal(sent)
     ended = persist("recipes")
     assert (ended.code, ended.err) == (
-        143,
+        128 + sent,
         "stopped; what is written is whole, the same command goes on with it or begins anew\n",
     )
-    assert signal.getsignal(signal.SIGTERM) == before
+    assert signal.getsignal(sent) == before
 
 
 def test_a_folder_that_may_not_be_written_is_reported_before_any_work(persist, walks, tmp_path, monkeypatch):
@@ -230,3 +232,22 @@ def test_an_error_is_red_on_a_terminal_unless_the_user_wants_no_color(no_color, 
 def test_a_command_works_where_nobody_hears_it(closed):
     script = f'exec "$0" -m persist_cli recipes {closed}'
     assert subprocess.run(["sh", "-c", script, sys.executable], capture_output=True, check=False).returncode == 0
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="terminals are other ones there")
+@pytest.mark.parametrize("terminal", [False, True])
+def test_a_command_goes_on_when_its_terminal_is_closed_or_nobody_reads_its_progress_any_more(terminal, tmp_path):
+    reader, writer = os.openpty() if terminal else os.pipe()
+    done = tmp_path / "done"
+    script = (
+        "import sys; from pathlib import Path; from persist_cli.cli.options import outlive_listeners\n"
+        "outlive_listeners(); sys.stdin.read(); print(1, file=sys.stderr, flush=True); print(2, flush=True)\n"
+        "Path(sys.argv[1]).touch()"
+    )
+    out = writer if terminal else subprocess.DEVNULL
+    command = [sys.executable, "-c", script, str(done)]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=out, stderr=writer)
+    os.close(writer)
+    os.close(reader)
+    process.communicate()
+    assert (process.returncode, done.exists()) == (0, True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
 import socket
 import sys
 import threading
@@ -13,13 +12,14 @@ from websockets.exceptions import ConnectionClosed
 
 from persist_cli.data.store import Store
 from persist_cli.io.own_address import address_of, bind, names_of
+from persist_cli.io.signals import STOPPING
 from persist_cli.play import serve
 from persist_cli.play.worker import Workers
 from tests.support.play_pages import open_page
 from tests.support.processes import start_persist, wait_until
 
 
-@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("stop", STOPPING)
 def test_ctrl_c_ends_the_command_without_an_error_while_somebody_walks(voxel, walks, tmp_path, stop):
     printed, out = tmp_path / "printed", tmp_path / "recordings"
     process = start_persist(

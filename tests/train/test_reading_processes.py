@@ -10,6 +10,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from persist_cli.io.signals import STOPPING
 from persist_cli.train.training_loop import StopSignal, held_back_signals
 from tests.support.micro_policies import policy_stage
 from tests.support.micro_runs import equal_runs, stage
@@ -42,15 +43,15 @@ def test_a_signal_to_all_processes_ends_none_that_still_begins():
     with held_back_signals():
         process = multiprocessing.Process(target=time.sleep, args=(0.1,))
         process.start()
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in STOPPING:
             os.kill(process.pid, number)
     process.join()
     assert process.exitcode == 0
 
 
 def test_a_signal_that_is_held_back_comes_nevertheless():
-    with StopSignal() as stop:
+    with StopSignal.awaited() as stop:
         with held_back_signals():
             os.kill(os.getpid(), signal.SIGINT)  # another thread, which does not hold it back, may take it at once
         assert stop.signal == signal.SIGINT
-    assert not {signal.SIGINT, signal.SIGTERM} & signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    assert not {*STOPPING} & signal.pthread_sigmask(signal.SIG_BLOCK, ())
