@@ -10,6 +10,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
+import torch
+
 from persist_cli.api.checkpoint import SCENE_CARD
 from persist_cli.api.meta_device import without_weights
 from persist_cli.api.network_card import CardKind, NetworkCard, card_folder, find_card, write_card
@@ -49,13 +51,14 @@ class TrainedSceneModel(NetworkCard):
             return make_scene_model(self.plugin, self.settings).form
 
     def load(self) -> SceneModel:
-        """Return the model with its weights, ready to sample.
+        """Return the model with its weights, ready to sample; torch's random state stays, also in a training.
 
         Raises:
             CheckpointError: when it has only a codec, or a file is missing or damaged, or does not fit.
         """
         self._check_stage()
-        model = make_scene_model(self.plugin, self.settings)
+        with torch.random.fork_rng(devices=[]):  # of the weights that are replaced
+            model = make_scene_model(self.plugin, self.settings)
         self.load_into(model, self.stage)
         return model.eval()
 

@@ -13,6 +13,7 @@ import torch
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.checkpoints.load import adapter_memory
 from persist_cli.checkpoints.scene_models import find_scene_model, save_scene_model
+from persist_cli.memorize.imagining import _loaded
 from persist_cli.output.video import read_video
 from persist_cli.plugins import make_scene_model
 from persist_cli.recipe import make_recipe, read_recipe
@@ -20,7 +21,7 @@ from persist_cli.simulators.house_cells import FORM as HOUSES
 from tests.support.cell_houses import FORM
 from tests.support.cell_walks import write_with_cells
 from tests.support.damage import without_sums
-from tests.support.micro_runs import SIZE, run_persist, stage
+from tests.support.micro_runs import SIZE, equal_runs, run_persist, stage
 from tests.support.micro_scenes import MICRO_SCENE
 
 SCENE = [
@@ -111,6 +112,19 @@ def test_a_run_goes_on_with_the_scene_model_that_it_began_with_and_with_no_other
     assert "give memory.settings.model=FOLDER that has them" in ended.err
     ended = persist(*begin, f"memory.settings.model={scene_model}", "--resume")
     assert ended.code == 0, ended.err
+
+
+def test_a_run_whose_scene_model_is_loaded_anew_when_it_goes_on_equals_an_uninterrupted_one_to_the_bit(
+    renderer, scene_model, cells, stage1, tmp_path, persist
+):
+    for name, halves in (("whole", [2]), ("halves", [1, 2])):
+        (tmp_path / name).mkdir()
+        begin = imagined_stage(tmp_path / name, renderer, str(scene_model), cells, stage1)[:-3]  # without its cache
+        for steps in halves:
+            _loaded.cache_clear()  # as in a process of its own
+            ended = persist(*begin, f"training.steps={steps}", "training.schedule=constant", "--resume")
+            assert ended.code == 0, ended.err
+    assert equal_runs(tmp_path / "whole/run", tmp_path / "halves/run")
 
 
 def test_an_evaluation_goes_on_with_the_scene_model_that_it_began_with_and_with_no_other(
