@@ -244,7 +244,7 @@ def parse_yaml_mapping(text: str, where: str) -> dict[str, Any]:
         where: the recipe's name or file, with which error messages begin.
 
     Raises:
-        RecipeError: one line that says where the text stops being YAML, or that it is no mapping.
+        RecipeError: one line that says where the text stops being YAML or has a key twice, or that it is no mapping.
     """
     try:
         values = read_yaml(text)

@@ -170,6 +170,7 @@ def test_an_unknown_missing_or_broken_recipe_is_one_line(tmp_path):
     (tmp_path / "b.yaml").write_text("- 1")
     (tmp_path / "d.yaml").write_bytes("description: Räume".encode("latin-1"))
     (tmp_path / "e.yaml").write_text("description: 2024-13-45")
+    (tmp_path / "f.yaml").write_text("training: {steps: 1}\nstage: codec\ntraining: {batch: 2}\n")
     for name, cause in (
         ("tiny-stage3", "did you mean"),
         ("c.yaml", "no such recipe file"),
@@ -177,6 +178,7 @@ def test_an_unknown_missing_or_broken_recipe_is_one_line(tmp_path):
         (str(tmp_path / "b.yaml"), "a recipe is a mapping"),
         (str(tmp_path / "d.yaml"), r"d\.yaml: not UTF-8 \(byte 14"),
         (str(tmp_path / "e.yaml"), r"not YAML \(month must be in 1\.\.12\)"),
+        (str(tmp_path / "f.yaml"), r"the key 'training' stands twice"),
     ):
         with pytest.raises(RecipeError, match=cause) as error:
             read_recipe(name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any, Final
 
 import yaml
@@ -9,15 +10,28 @@ import yaml
 MOST: Final = 100_000  # values that a text may stand for, those of its aliases counted each time
 
 
+class UniqueKeys(yaml.SafeLoader):
+    """Reads YAML as ``safe_load`` does, but refuses a key that a mapping has twice; that would drop the first value."""
+
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+        """The mapping, after a check of its keys."""
+        node: yaml.MappingNode = super().compose_mapping_node(anchor)
+        names = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        twice = next((name for name, count in Counter(names).items() if count > 1), None)
+        if twice is not None:
+            raise yaml.MarkedYAMLError(problem=f"the key {twice!r} stands twice", problem_mark=node.start_mark)
+        return node
+
+
 def read_yaml(text: str) -> Any:
     """The plain values of a YAML text.
 
     Raises:
-        yaml.YAMLError: when it is not YAML, or asks for an object of Python.
+        yaml.YAMLError: when it is not YAML, has a key twice, or asks for an object of Python.
         ValueError: when it is nested too deeply, contains itself or stands for too many values, or for a date such as
             2024-13-45.
     """
-    loader = yaml.SafeLoader(text)
+    loader = UniqueKeys(text)
     try:
         root = loader.get_single_node()
         if root is None:
