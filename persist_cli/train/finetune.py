@@ -80,6 +80,7 @@ from persist_cli.train.sources import (
     has_same_data,
     held_sources,
     known_hashes,
+    knows_other_data,
     knows_scene_model,
     with_own_adapter,
 )
@@ -93,6 +94,11 @@ LONGEST_WAIT: Final = timedelta(hours=1)  # for a process that does not answer, 
 RANDOM_CODEC: Final = (
     "begins with random weights, those of the codec too; give backbone.settings.pretrained=DIR for a pretrained model, "
     "or base=RUN for a codec trained here"
+)
+
+OTHER_DATA: Final = (
+    "its data have changed since it was stopped; it goes on with what is there, and will not equal a run that was not "
+    "stopped"
 )
 
 DISTILLED_BASE: Final = (
@@ -226,6 +232,8 @@ def prepare_run(trainer: TrainingLoop[Any], run: Path, base: Checkpoint | None, 
     """The run's folder, with its trainer in the state of the folder's newest checkpoint where there is one."""
     trainer.times.enabled = plan.profile
     load_state(run, trainer.state)
+    if trainer.accelerator.is_main_process and knows_other_data(trainer.recipe, run):
+        warn(f"{run}: {OTHER_DATA}")
     if trainer.accelerator.log_with:
         trainer.accelerator.init_trackers("persist")
     return RunFolder(run, trainer, base)

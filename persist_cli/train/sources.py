@@ -98,6 +98,11 @@ def has_same_data(recipe: Recipe, run: Path) -> bool:
     return (run / DATA).is_file() and read_json(run / DATA) == data_files(recipe)
 
 
+def knows_other_data(recipe: Recipe, run: Path) -> bool:
+    """Whether a run that has begun says that its data were others; those of earlier versions do not."""
+    return bool(step_folders(run)) and (run / DATA).is_file() and not has_same_data(recipe, run)
+
+
 def check_scene_model(recipe: Recipe, run: Path) -> None:
     """Raise ``CheckpointError`` when other weights would imagine in a run's scenes than those that it began with."""
     if recipe.memory is None or not knows_scene_model(run):

@@ -28,6 +28,16 @@ def test_a_run_goes_on_with_its_data_at_another_place_and_with_no_others(persist
     assert "data.path changed" in persist(*run, "training.steps=4", "--resume").err
 
 
+def test_a_run_says_that_its_data_changed_while_it_was_stopped(persist, walks, codec, tmp_path):
+    shutil.copytree(walks, tmp_path / "data")
+    run = stage("stage1", tmp_path / "data", tmp_path / "run", f"base={codec}")
+    assert persist(*run, "training.steps=1").code == 0
+    sorted((tmp_path / "data").glob("*.parquet"))[0].unlink()
+    ended = persist(*run, "training.steps=2", "--resume")
+    assert (ended.code, "its data have changed since it was stopped" in ended.err) == (0, True)
+    assert "changed" not in persist(*run, "training.steps=3", "--resume").err
+
+
 def test_a_run_goes_on_when_the_adapter_that_it_began_with_is_gone(persist, walks, stage1, voxel, tmp_path):
     shutil.copytree(stage1, tmp_path / "stage1")
     shutil.copytree(voxel, tmp_path / "voxel")
