@@ -79,7 +79,7 @@ class Checkpoint:
             CheckpointError: when there is no such adapter; the message names those that there are.
         """
         if adapter not in self.adapters:
-            known = ", ".join(self.adapters) or "none"
+            known = ", ".join(self.adapters) or "no adapter"
             raise CheckpointError(f"{self.folder}: no memory adapter {adapter!r} in it; it has {known}")
         return self.adapters[adapter]
 

@@ -129,7 +129,9 @@ def adapter_of(checkpoint: Checkpoint, memory: str | None) -> tuple[MemoryConfig
     preferred = [name for name in (memory, checkpoint.default) if name in readers]
     if not readers:
         text = "a memory" if memory is None else f"a memory {memory!r}"
-        raise CheckpointError(f"{checkpoint.folder}: no adapter reads {text}; it has {', '.join(memories) or 'none'}")
+        raise CheckpointError(
+            f"{checkpoint.folder}: no adapter reads {text}; it has {', '.join(memories) or 'no adapter'}"
+        )
     adapter = str([*preferred, *readers][0])
     return adapter_memory(checkpoint, adapter), f"adapter {adapter!r} of {checkpoint.folder}"
 

@@ -10,7 +10,9 @@ import signal
 
 import pytest
 
+from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.cli.app import main
+from persist_cli.errors import CheckpointError
 from persist_cli.io.files import read_json, write_json
 from tests.support.micro_runs import without_depth
 from tests.support.processes import run_command, run_in_pair, start_persist, wait_until
@@ -211,6 +213,15 @@ def test_an_impossible_evaluation_is_one_line_and_leaves_no_folder(persist, voxe
     ended = persist("eval", voxel, "--data", held_out, "--memories", "voxel", *options, "--out", tmp_path / "o")
     assert (ended.code, cause in ended.err) == (1, True), ended.err
     assert not (tmp_path / "o").exists()
+
+
+def test_a_memory_of_a_checkpoint_without_adapters_is_refused_and_no_name_of_a_memory_stands_for_nothing(
+    persist, stage1, held_out, tmp_path
+):
+    ended = persist("eval", stage1, "--data", held_out, "--memories", "none", "--out", tmp_path / "o")
+    assert "'none'; there is no adapter, only stage1, which has no memory" in ended.err
+    with pytest.raises(CheckpointError, match="no memory adapter 'none' in it; it has no adapter"):
+        find_checkpoint(stage1).adapter_folder("none")
 
 
 def test_eval_without_checkpoint_or_trajectories_names_what_is_missing(persist, voxel, held_out, tmp_path):

@@ -274,7 +274,8 @@ def checkpoints_with(memory: str, checkpoints: Sequence[Checkpoint]) -> list[Che
     owners = [checkpoint for checkpoint in checkpoints if memory in checkpoint.adapters]
     if not owners:
         known = sorted({name for checkpoint in checkpoints for name in checkpoint.adapters})
-        raise CheckpointError(f"no checkpoint has a memory adapter {memory!r}; there are: {', '.join(known) or 'none'}")
+        there = f"there are: {', '.join(known)}" if known else f"there is no adapter, only {PLAIN}, which has no memory"
+        raise CheckpointError(f"no checkpoint has a memory adapter {memory!r}; {there}")
     return owners
 
 
