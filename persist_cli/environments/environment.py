@@ -92,9 +92,14 @@ class HouseEnv(gymnasium.Env[Observation, Any]):
         return self.attempt.observation(), self.attempt.info()
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Take one action, or ``chunk`` of them; the episode ends at the goal."""
+        """Take one action, or ``chunk`` of them; the episode ends at the goal.
+
+        Raises:
+            DataError: when they are not of the action space; nothing was done then.
+        """
         attempt = self.attempt
-        reward = attempt.advance(self.scenes.walk({0: named(action, self.actions)})[0])
+        names = named(action, self.actions, self.scenes.task.chunk)
+        reward = attempt.advance(self.scenes.walk({0: names})[0])
         return attempt.observation(), reward, attempt.reached, False, attempt.info()
 
     def render(self) -> Array | None:
@@ -151,10 +156,17 @@ class HouseVectorEnv(VectorEnv[Observation, Array, Array]):
         return self._observations(), infos
 
     def step(self, actions: Array) -> tuple[Observation, Array, Array, Array, dict[str, Any]]:
-        """Take one action, or ``chunk`` of them, in each environment."""
+        """Take one action, or ``chunk`` of them, in each environment.
+
+        Raises:
+            DataError: when they are not of the action space; nothing was done then.
+        """
         if not self._attempts:
             raise ResetNeeded("reset() comes before step()")
-        views = self.scenes.walk({number: named(action, self.actions) for number, action in enumerate(actions)})
+        if np.ndim(actions) == 0 or len(actions) != self.num_envs:
+            raise DataError(f"actions of shape {np.shape(actions)}: {self.num_envs} environments take one each")
+        names = {n: named(action, self.actions, self.scenes.task.chunk) for n, action in enumerate(actions)}
+        views = self.scenes.walk(names)
         rewards = np.array([attempt.advance(views[number]) for number, attempt in enumerate(self._attempts)])
         reached = np.array([attempt.reached for attempt in self._attempts])
         truncated = np.array([self._is_over(attempt) for attempt in self._attempts])
@@ -187,17 +199,22 @@ class HouseVectorEnv(VectorEnv[Observation, Array, Array]):
         return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
 
 
-def named(action: Any, names: Sequence[str]) -> list[str]:
-    """Return the names of the actions of one step: of a number, or of a chunk of numbers.
+def named(action: Any, names: Sequence[str], chunk: int) -> list[str]:
+    """Return the names of the actions of one step.
+
+    Args:
+        action: a number, or ``chunk`` numbers.
+        names: of all actions.
+        chunk: number of actions that one step takes.
 
     Raises:
-        DataError: for a number that no action has.
+        DataError: for anything else, and a number that no action has.
     """
-    numbers = [int(number) for number in np.atleast_1d(action)]
-    for number in numbers:
-        if not 0 <= number < len(names):
-            raise DataError(f"action {number}: they are 0 to {len(names) - 1} ({', '.join(names)})")
-    return [names[number] for number in numbers]
+    numbers = np.asarray(action)
+    wanted = "one" if chunk == 1 else f"a list of {chunk}"
+    if numbers.dtype.kind not in "iu" or numbers.size != chunk or not ((numbers >= 0) & (numbers < len(names))).all():
+        raise DataError(f"action {action}: a step takes {wanted} of 0 to {len(names) - 1} ({', '.join(names)})")
+    return [names[number] for number in numbers.reshape(-1).tolist()]
 
 
 def environment_seeds(seed: int | Sequence[int | None] | None, count: int) -> Sequence[int | None]:

@@ -36,12 +36,34 @@ def test_actions_are_those_that_move_in_the_order_of_the_vocabulary():
     assert make().unwrapped.actions == ("forward", "left", "right")
 
 
-def test_an_action_that_there_is_not_is_named():
+@pytest.mark.parametrize("wrong", [3, -1, 0.7, None, "left", [0, 1], []])
+def test_what_is_not_an_action_is_refused_and_nothing_is_done(wrong):
     env = make().unwrapped
     env.reset(seed=0)
-    for wrong in (3, -1):
-        with pytest.raises(PersistError, match=rf"action {wrong}: they are 0 to 2 \(forward, left, right\)"):
+    with pytest.raises(PersistError, match=r"^action .*: a step takes one of 0 to 2 \(forward, left, right\)$"):
+        env.step(wrong)
+    assert env.attempt.steps == 0
+
+
+def test_a_step_of_several_actions_takes_as_many():
+    env = make(chunk=2).unwrapped
+    env.reset(seed=0)
+    for wrong in (0, [0, 1, 2], [0, 7]):
+        with pytest.raises(PersistError, match="a step takes a list of 2 of 0 to 2"):
             env.step(wrong)
+    env.step(np.array([1, 2]))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"), [([1], "2 environments take one"), (1, "2 environments take one"), ([1, 7], "action 7")]
+)
+def test_a_vector_takes_an_action_for_each_environment_or_does_nothing(wrong, words):
+    envs = gymnasium.make_vec(NAME, num_envs=2, **HOUSES)
+    seen = envs.reset(seed=0)[0]
+    with pytest.raises(PersistError, match=words):
+        envs.step(np.array(wrong))
+    assert np.array_equal(envs._observations()["pose"], seen["pose"])
+    assert np.array_equal(envs.scenes.houses[0]._view(free=True).rgb, seen["rgb"][0])
 
 
 def test_equal_seeds_give_equal_episodes_and_other_seeds_others():
