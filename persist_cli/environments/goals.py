@@ -150,7 +150,8 @@ class KnownGround:
     def metres(self, positions: Float[Tensor, "place 3"], goal: Float[Tensor, " 3"]) -> Float[Tensor, " place"]:
         """Return the metres from world positions to a goal, float64; always finite.
 
-        They are straight where the task says so, and where the goal is inside something to which no ground leads.
+        They are straight where the task says so, and where the goal is inside something to which no ground leads. From
+        a place without a way, such as one that walls enclose, they are straight to ground from which a way leads.
         """
         places, there = self.ground.places(positions), self.ground.places(goal)
         distances = None if self.task.distance == "straight" else self._distances(there)

@@ -51,6 +51,13 @@ def test_a_goal_inside_something_thick_is_as_far_as_a_line_to_it():
     assert metres(ground, (2.0, 2.0), (4.9, 2.0)) == pytest.approx(2.9)
 
 
+def test_from_ground_without_a_way_a_line_leads_through_the_wall():
+    ground = walled()
+    ground.states[30:, 30] = int(Cover.OCCUPIED)  # the wall now parts the house
+    ground.states[[0, -1], :31], ground.states[:, 0] = int(Cover.OCCUPIED), int(Cover.OCCUPIED)  # and closes one part
+    assert metres(ground, (2.0, 2.0), (5.0, 2.0)) == pytest.approx(3.0, abs=0.1)
+
+
 def test_free_places_are_those_that_can_be_reached_from_the_start_at_its_height():
     ground = walled()
     ground.states[30:, 30] = int(Cover.OCCUPIED)  # the wall now parts the house
