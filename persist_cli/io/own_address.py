@@ -112,8 +112,12 @@ def open_browser(address: str) -> None:
         webbrowser.open(address)
 
 
-def leave() -> None:
-    """End the program although a model still works: its thread must not run while Python is taken down."""
+def leave(code: int = 0) -> None:
+    """End the program although a model still works: its thread must not run while Python is taken down.
+
+    Args:
+        code: exit code.
+    """
     sys.stdout.flush()
     sys.stderr.flush()
-    os._exit(0)
+    os._exit(code)

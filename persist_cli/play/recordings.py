@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from persist_cli.errors import PersistError
-from persist_cli.io.files import folder_aside
+from persist_cli.io.files import folder_aside, remove_leftovers
 from persist_cli.output.console import warn
 from persist_cli.play.messages import Recorded
 from persist_cli.play.play import Play
@@ -43,6 +43,7 @@ class Recordings:
             self._temporary = tempfile.TemporaryDirectory(prefix="persist-play-", ignore_cleanup_errors=True)
             folder = Path(self._temporary.name)
         self.folder = folder
+        self.under_way: set[str] = set()  # names of the folders that are being written
         self._downloads: dict[str, Download] = {}
 
     def find(self, name: str) -> Download | None:
@@ -64,8 +65,10 @@ class Recordings:
         self._downloads.pop(name, None)
 
     def close(self) -> None:
-        """Delete what does not stay."""
+        """Delete what does not stay, and what is half written."""
         self._downloads.clear()
+        if self.under_way:
+            remove_leftovers(self.folder, *self.under_way)
         if self._temporary is not None:
             self._temporary.cleanup()
 
@@ -86,6 +89,7 @@ class Shelf:
                 and it goes on.
         """
         folder = self._recordings.folder / f"{time.strftime('walk-%Y%m%d-%H%M%S')}-{secrets.token_hex(2)}"
+        self._recordings.under_way.add(folder.name)
         try:
             with folder_aside(folder) as aside:
                 saved = play.save_recording(aside)
@@ -94,6 +98,8 @@ class Shelf:
             raise PersistError(
                 f"{folder}: {error.strerror}; make room there, and end the recording once more"
             ) from error
+        finally:
+            self._recordings.under_way.discard(folder.name)
         play.end_recording()
         self._folders.append(folder)
         video = self._publish(Download(folder / saved.video.name, "walk.mp4", "video/mp4"))

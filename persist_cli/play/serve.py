@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import sys
 import threading
@@ -22,10 +23,10 @@ from persist_cli.play.recordings import Recordings
 from persist_cli.play.server import Server, make_app
 from persist_cli.play.sessions import Limits, Sessions
 from persist_cli.play.walking_page import walking_page
-from persist_cli.play.worker import Workers
 
 LAST_CALL_SECONDS: Final = 1.0  # that a call to the model may still take when the server has ended
-SAVING_SECONDS: Final = 120.0  # the same, where a recording is saved; a full one takes a minute or more
+LOOK_SECONDS: Final = 0.5  # after which it is looked again whether recordings are saved
+INTERRUPTED: Final = 130
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +51,9 @@ class ServeOptions:
 
 
 def run_play(options: PlayOptions, serving: ServeOptions) -> None:
-    """Serve a page to walk in a model until Ctrl-C or SIGTERM, which end it without an error.
+    """Serve a page to walk in a model until Ctrl-C, SIGTERM or SIGHUP, which end it without an error.
+
+    What is recorded then is saved, where recordings stay. Another Ctrl-C ends the program at once, with code 130.
 
     Raises:
         PersistError: one line when the port is taken, or model, start and memories are missing or do not go together.
@@ -66,28 +69,36 @@ def run_play(options: PlayOptions, serving: ServeOptions) -> None:
             server = Server(app, sessions, lambda: announce(bound, serving))
             signals.end(server)
             server.serve_on(bound)
-            done = end_workers(sessions.workers, saves=serving.recordings is not None)
+            signals.end(None)
+            code = end_workers(sessions)
         except KeyboardInterrupt:  # before there was a server
             return
         finally:
             bound.close()
             recordings.close()
-        if not done:
-            leave()
+        if code is not None:
+            leave(code)
 
 
-def end_workers(workers: Workers, saves: bool) -> bool:
-    """Let workers end, and return whether they have; where they save they get longer, and it is told.
+def end_workers(sessions: Sessions) -> int | None:
+    """Let the workers end, and return ``None`` when they have, else the code with which the program shall be left.
+
+    Recordings that stay are waited for until they are saved, and it is told; ``KeyboardInterrupt`` ends that.
 
     Args:
-        workers: have nothing to do but what they were given.
-        saves: whether they may save recordings that stay.
+        sessions: have all ended.
     """
-    done = workers.close(LAST_CALL_SECONDS)
-    if saves and not done:
-        warn("what was recorded is saved before this ends, which can take a minute")
-        done = workers.close(SAVING_SECONDS)
-    return done
+    try:
+        done = sessions.workers.close(LAST_CALL_SECONDS)
+        if not done and sessions.unsaved:
+            warn("what was recorded is saved before this ends, which can take a minute; Ctrl-C ends it without that")
+        while not done and sessions.unsaved:
+            done = sessions.workers.close(LOOK_SECONDS)
+    except KeyboardInterrupt:
+        if sessions.unsaved:
+            warn("what was recorded last is lost, not saved")
+        return INTERRUPTED
+    return None if done else 0
 
 
 def first_ready(walk: Callable[[], Play]) -> Callable[[], Play]:
@@ -97,7 +108,7 @@ def first_ready(walk: Callable[[], Play]) -> Callable[[], Play]:
 
 
 class StopSignals:
-    """Lets signals that ask to stop end a server; before there is one they raise ``KeyboardInterrupt``."""
+    """Lets signals that ask to stop end a server; before there is one, and after it, they raise ``KeyboardInterrupt``."""
 
     def __init__(self) -> None:
         self._server: Server | None = None
@@ -110,9 +121,14 @@ class StopSignals:
     def __exit__(self, *error: Any) -> None:
         self._caught.__exit__(*error)
 
-    def end(self, server: Server) -> None:
-        """Let the signals end this server from now on."""
+    def end(self, server: Server | None) -> None:
+        """Let the signals end this server from now on; ``None`` when it has ended.
+
+        From then on SIGHUP does nothing, since a terminal that is closed may send it twice.
+        """
         self._server = server
+        if server is None and hasattr(signal, "SIGHUP"):
+            signal.signal(signal.SIGHUP, signal.SIG_IGN)
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
         if self._server is None:

@@ -7,7 +7,6 @@ import sys
 import traceback
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Final
 
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketDisconnected
@@ -67,6 +66,7 @@ class Sessions:
         self.open_play, self.limits, self.recordings = open_play, limits, recordings
         self.workers = Workers()
         self.open: set[Session] = set()
+        self.ending: set[Session] = set()  # what they recorded may still be saved
         self._closing = False
 
     async def serve(self, socket: WebSocket) -> None:
@@ -86,6 +86,11 @@ class Sessions:
     def somebody_walks(self) -> bool:
         """Whether some page waits for its next frame."""
         return any(session.wishes.restless and session.wishes.pace.is_open for session in self.open)
+
+    @property
+    def unsaved(self) -> bool:
+        """Whether a session that has ended recorded something that is to stay and is not saved yet."""
+        return self.recordings.stays and any(session.records for session in list(self.ending))
 
     async def _has_room(self) -> bool:
         """Return whether another session may begin; a tab that is loaded again waits for its old one to end."""
@@ -136,8 +141,20 @@ class Session:
             for part in parts:
                 part.cancel()
             await asyncio.gather(*parts, return_exceptions=True)
-            self.workers.give_last(partial(self.shelf.clear, self._play))  # after what is under way
+            self.sessions.ending.add(self)
+            self.workers.give_last(self._clear)  # after what is under way
             self.over.set_result(None)
+
+    @property
+    def records(self) -> bool:
+        """Whether there is a recording, which is not saved yet."""
+        return self._play is not None and self._play.recording
+
+    def _clear(self) -> None:
+        try:
+            self.shelf.clear(self._play)
+        finally:
+            self.sessions.ending.discard(self)
 
     async def _walk(self) -> None:
         self._play = await self.workers.model.run(self.sessions.open_play)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+import signal
 import socket
 import sys
 import threading
@@ -14,9 +16,9 @@ from persist_cli.data.store import Store
 from persist_cli.io.own_address import address_of, bind, names_of
 from persist_cli.io.signals import STOPPING
 from persist_cli.play import serve
-from persist_cli.play.worker import Workers
-from tests.support.play_pages import open_page
-from tests.support.processes import start_persist, wait_until
+from tests.support.micro_plays import micro_walks
+from tests.support.play_pages import open_page, serving, until
+from tests.support.processes import ForkedProcess, run_command, start_persist, wait_until
 
 
 @pytest.mark.parametrize("stop", STOPPING)
@@ -39,16 +41,48 @@ def test_ctrl_c_ends_the_command_without_an_error_while_somebody_walks(voxel, wa
     assert len(Store(next(out.iterdir()) / "data")[0].read()) > 2
 
 
-def test_a_recording_that_is_still_saved_is_waited_for_and_the_terminal_says_so(monkeypatch, capsys):
+@pytest.mark.parametrize("stays", [True, False])
+def test_a_recording_that_stays_is_waited_for_however_long_a_clip_takes(stays, walks, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(serve, "LAST_CALL_SECONDS", 0.1)
-    workers, may_end, saved = Workers(), threading.Event(), []
-    workers.give_last(lambda: saved.append(may_end.wait(60)))
-    assert not serve.end_workers(workers, saves=False)
-    assert capsys.readouterr().err == ""
-    threading.Timer(0.5, may_end.set).start()
-    assert serve.end_workers(workers, saves=True)
-    assert saved == [True]
-    assert capsys.readouterr().err.startswith("what was recorded is saved before this ends")
+    monkeypatch.setattr(serve, "LOOK_SECONDS", 0.1)
+    clip = threading.Event()
+    with serving(micro_walks(walks), folder=tmp_path if stays else None) as served:
+        with served.page() as page:
+            page.say("record", on=True)
+            page.say("keys", held=["left"])
+            page.frames(2)
+            served.sessions.workers.model.give(clip.wait)
+            served.stop()
+            until(lambda: served.sessions.ending)
+        threading.Timer(1.0, clip.set).start()
+        assert serve.end_workers(served.sessions) == (None if stays else 0)
+        told = capsys.readouterr().err
+        assert told.startswith("what was recorded is saved before this ends") == stays
+        clip.set()
+    assert len([*tmp_path.iterdir()]) == stays
+
+
+def play_without_end_of_saving(arguments: list[str]) -> None:
+    """Run ``persist play``, whose recordings take for ever to be saved."""
+    shutil.make_archive = lambda *_: threading.Event().wait()
+    run_command(arguments)
+
+
+def test_a_second_ctrl_c_ends_the_command_at_once_while_a_recording_is_saved(voxel, walks, tmp_path):
+    printed, out = tmp_path / "printed", tmp_path / "recordings"
+    arguments = ["play", voxel, "--start", f"{walks}#0:2", "--port", 0, "--json", "--out", out]
+    process = ForkedProcess(play_without_end_of_saving, [str(argument) for argument in arguments], output=printed)
+    wait_until(lambda: printed.is_file() and "}" in printed.read_text(), process)
+    with open_page(json.loads(printed.read_text())["address"]) as page:
+        page.say("record", on=True)
+        page.say("keys", held=["left"])
+        page.frames(3)
+    process.send(signal.SIGINT)
+    wait_until(lambda: "Ctrl-C ends it without that" in printed.read_text(), process)
+    process.send(signal.SIGINT)
+    assert process.wait() == 130
+    assert "what was recorded last is lost" in printed.read_text()
+    assert not [*out.iterdir()]
 
 
 def test_what_cannot_be_opened_is_said_before_a_page_is_served(persist, voxel, walks):

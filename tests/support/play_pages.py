@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from websockets.sync.client import ClientConnection, connect
@@ -116,9 +117,9 @@ class Served:
 
 
 @contextmanager
-def serving(walk: Callable[[], Play], limits: Limits | None = None) -> Iterator[Served]:
-    """Serve walks on a free port of this machine."""
-    recordings, started, bound = Recordings(), threading.Event(), bind("127.0.0.1", 0)
+def serving(walk: Callable[[], Play], limits: Limits | None = None, folder: Path | None = None) -> Iterator[Served]:
+    """Serve walks on a free port of this machine; recordings stay in a folder, if there is one."""
+    recordings, started, bound = Recordings(folder), threading.Event(), bind("127.0.0.1", 0)
     sessions = Sessions(walk, limits or Limits(frames_per_second=120), recordings)
     server = Server(make_app(walking_page(), sessions), sessions, started.set)
     thread = threading.Thread(target=server.serve_on, args=(bound,), daemon=True)  # one that hangs ends with the tests
