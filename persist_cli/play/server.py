@@ -8,7 +8,7 @@ import socket
 import sys
 import traceback
 from collections.abc import Callable, Collection, Iterator
-from typing import Final
+from typing import Any, Final
 
 import uvicorn
 from starlette.applications import Starlette
@@ -18,6 +18,7 @@ from starlette.responses import FileResponse, HTMLResponse, PlainTextResponse, R
 from starlette.routing import Route, WebSocketRoute
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from persist_cli.io.own_address import leads_here, same_host
 from persist_cli.play.messages import MOST_BYTES
@@ -28,6 +29,7 @@ from persist_cli.play.walking_page import WalkingPage
 # Connections beside those of sessions. Requests beyond get 503; WebSockets count, and ``Sessions`` refuses them.
 MORE_CONNECTIONS: Final = 32
 PING_SECONDS: Final = 20.0  # after which a page that says nothing is asked whether it is there, and is given up
+REQUEST_SECONDS: Final = 10.0  # in which a connection sends a whole request, or is closed
 GRACE_SECONDS: Final = 1.0  # for answers that are under way when the server ends
 
 SECURITY: Final = {
@@ -119,6 +121,44 @@ async def answer_fault(request: Request, error: Exception) -> Response:
     return PlainTextResponse("a fault of persist; the terminal says more", 500, SECURITY)
 
 
+class PromptConnection(H11Protocol):
+    """A connection that is closed where no request comes, so that idle ones do not keep others out."""
+
+    _waits: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Wait for the first request."""
+        super().connection_made(transport)
+        self._wait()
+
+    def on_response_complete(self) -> None:
+        """Wait for the next request."""
+        super().on_response_complete()
+        self._wait()
+
+    def handle_websocket_upgrade(self, event: Any) -> None:
+        """Leave the connection to the WebSocket, which looks itself whether its page is there."""
+        self._stop_waiting()
+        super().handle_websocket_upgrade(event)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Wait for nothing any more."""
+        self._stop_waiting()
+        super().connection_lost(exc)
+
+    def _wait(self) -> None:
+        self._stop_waiting()
+        self._waits = self.loop.call_later(REQUEST_SECONDS, self._close_if_idle)
+
+    def _stop_waiting(self) -> None:
+        if self._waits is not None:
+            self._waits.cancel()
+
+    def _close_if_idle(self) -> None:
+        if self.cycle is None or self.cycle.response_complete:
+            self.transport.close()
+
+
 class Server(uvicorn.Server):
     """A server that ends its sessions first, and leaves signals to its caller.
 
@@ -132,7 +172,8 @@ class Server(uvicorn.Server):
         most = sessions.limits.sessions + MORE_CONNECTIONS
         super().__init__(
             uvicorn.Config(
-                app, ws="websockets-sansio", ws_max_size=MOST_BYTES, ws_per_message_deflate=False,
+                app, http=PromptConnection,
+                ws="websockets-sansio", ws_max_size=MOST_BYTES, ws_per_message_deflate=False,
                 ws_ping_interval=PING_SECONDS, ws_ping_timeout=PING_SECONDS, limit_concurrency=most,
                 timeout_graceful_shutdown=int(GRACE_SECONDS), lifespan="off", access_log=False, log_level="critical",
                 proxy_headers=False, server_header=False,

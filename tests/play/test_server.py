@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import socket
+import time
 
 import pytest
 from websockets.exceptions import InvalidStatus
 
 from persist_cli.errors import PersistError
 from persist_cli.io.own_address import bind, same_host
+from persist_cli.play import server as server_module
 from persist_cli.play.recordings import Download
 from persist_cli.play.server import OwnAddress
 from persist_cli.play.walking_page import walking_page
 from tests.support.micro_plays import micro_walks
-from tests.support.play_pages import serving
+from tests.support.play_pages import serving, until
 
 
 @pytest.fixture(scope="module")
@@ -150,3 +153,26 @@ def test_a_host_that_is_not_here_is_said_in_one_line():
         bind("192.0.2.1", 0)
     with pytest.raises(PersistError, match=r"--host a\.\.b: no valid name"):
         bind("a..b", 0)
+
+
+def test_connections_that_send_no_whole_request_keep_others_out_for_a_moment_only(walks, monkeypatch):
+    monkeypatch.setattr(server_module, "REQUEST_SECONDS", 1.0)
+    with serving(micro_walks(walks)) as served, contextlib.ExitStack() as idle:
+        host, port = served.address.removeprefix("http://").rstrip("/").split(":")
+        for begun in (b"", b"GET / HTTP/1.1\r\nHost: x") * 20:
+            raw = idle.enter_context(socket.create_connection((host, int(port)), timeout=60))
+            raw.sendall(begun)
+        until(lambda: ask(served, "/")[0] == 503)
+        until(lambda: ask(served, "/")[0] == 200)
+        with served.page() as page:
+            page.say("keys", held=["left"])
+            page.frames(3)
+
+
+def test_a_page_that_walks_is_not_idle(walks, monkeypatch):
+    monkeypatch.setattr(server_module, "REQUEST_SECONDS", 0.1)
+    with serving(micro_walks(walks)) as served, served.page() as page:
+        page.until("welcome")
+        time.sleep(0.5)
+        page.say("keys", held=["left"])
+        page.frames(2)
