@@ -203,6 +203,8 @@ def prepare(plan: BenchPlan, out: Path, processes: Processes) -> PlanningBench:
     uses_model, named = any(row.uses_world_model for row in rows), plan.checkpoint != Path(REFERENCE)
     found = find_checkpoint(plan.checkpoint) if uses_model or named else None
     checkpoint = found if uses_model else None
+    if checkpoint is not None:
+        check_adapters(checkpoint, rows)
     journal = PlanningJournal(out)
     if processes.main:
         values = identity(plan, rows, cost, checkpoint, policies[plan.policy])
@@ -211,7 +213,7 @@ def prepare(plan: BenchPlan, out: Path, processes: Processes) -> PlanningBench:
         journal.check(values)
         episodes = journal.episodes() if journal.begun else plan.source.episodes()
         if checkpoint is not None:
-            check_model(checkpoint, rows, episodes)
+            check_size(checkpoint, episodes)
         learned = trained_policy(policies[plan.policy])
         refuse_training_episodes(episodes.scenes, checkpoint, learned, plan.allow_training_scenes)
         check_budget(plan, rows, episodes)
@@ -284,11 +286,15 @@ def check_policies(rows: Sequence[PlanningRow], policies: Mapping[str | None, Po
             )
 
 
-def check_model(checkpoint: Checkpoint, rows: Sequence[PlanningRow], episodes: EpisodeSet) -> None:
-    """Raise ``PersistError`` when the model lacks an adapter of a row, or takes images of another size."""
+def check_adapters(checkpoint: Checkpoint, rows: Sequence[PlanningRow]) -> None:
+    """Raise ``PersistError`` when the model lacks the adapter of a row."""
     for row in rows:
         if row.uses_world_model and (adapter := adapter_of(checkpoint, row)) is not None:
             adapter_memory(checkpoint, adapter)
+
+
+def check_size(checkpoint: Checkpoint, episodes: EpisodeSet) -> None:
+    """Raise ``DataError`` when the model takes images of another size."""
     size = empty_backbone(checkpoint).image_size
     ours = tuple(episodes.settings.get(side, 64) for side in ("height", "width"))
     if ours != tuple(size):

@@ -363,8 +363,11 @@ def test_bad_options_are_one_line(bench: Bench, tmp_path: Path, options: tuple[s
     assert not (tmp_path / "bench/metrics.json").exists()
 
 
-def test_a_memory_that_the_model_lacks_is_refused(bench: Bench, voxel: Path) -> None:
-    ended = bench(voxel, "--cost", "geodesic", "--rows", "rank-2", "--memories", "map2d")
+def test_a_memory_that_the_model_lacks_is_refused_before_episodes_are_looked_for(
+    persist: Persist, voxel: Path, tmp_path: Path
+) -> None:
+    options = ("--episodes", tmp_path / "none-yet.json", "--cost", "geodesic", "--rows", "rank-2")
+    ended = persist("bench", "plan", voxel, *options, "--memories", "map2d", "--out", tmp_path / "bench")
     assert ended.code == 1
     assert "map2d" in ended.err
     assert len(ended.err.strip().splitlines()) == 1
