@@ -108,7 +108,7 @@ def first_ready(walk: Callable[[], Play]) -> Callable[[], Play]:
 
 
 class StopSignals:
-    """Lets signals that ask to stop end a server; before there is one, and after it, they raise ``KeyboardInterrupt``."""
+    """Lets signals that ask to stop end a server; before there is one and after it they raise ``KeyboardInterrupt``."""
 
     def __init__(self) -> None:
         self._server: Server | None = None
