@@ -5,8 +5,11 @@ held-out houses and takes from it the one image that shows farthest. From this i
 that the scene model completes, and a voxel map. PPO learns in the Gymnasium environment of each, and in the true house
 as the ceiling, with equally many steps. It observes depth and the goal's place. How often it reaches its goals in the
 true house is measured before and after, by the same episodes. ``--images 24`` gives all images of the walk, at each of
-which an episode may start. ``--goals seen`` lets agents practise in every house made of images with goals that these
-show; in a scene they may otherwise lie in rooms that it imagined.
+which an episode may start.
+
+Two kinds of a scene tell what imagined rooms do: ``--memories scene,scene:seen,scene:true`` adds a scene of the image
+alone, in which nothing is imagined, and one of the house's own cells. With ``--goals seen`` the goals of practice in
+houses made of images lie where these show the ground; in a scene they may otherwise lie in rooms that it imagined.
 
 A scene may shut the agent in, so that no goal is far enough. Then nothing can be learned there, which is counted.
 
@@ -21,7 +24,7 @@ import math
 import shlex
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -31,10 +34,12 @@ from persist_cli.api.checkpoint import REFERENCE, find_checkpoint
 from persist_cli.api.scene import Scene
 from persist_cli.checkpoints.load import adapter_memory
 from persist_cli.checkpoints.scene_models import PACKAGED, find_scene_model
-from persist_cli.data.store import Store
+from persist_cli.data.store import Store, TrajectoryFile
 from persist_cli.errors import DataError, PersistError, PluginError
 from persist_cli.evaluate.statistics import LEAST_UNITS, Draws, mean_figure
 from persist_cli.io.files import read_json, write_json, write_text
+from persist_cli.memorize.factory import as_scene
+from persist_cli.memorize.memory_file import load_memory
 from persist_cli.output.console import say
 from persist_cli.plugins import load_plugin
 from persist_cli.reproduce.commands import run_line, run_main
@@ -62,6 +67,10 @@ BATCH: Final = 256
 
 TRUE_AGENTS: Final = 4  # that are measured together
 
+KINDS: Final = ("seen", "true")  # of a scene: the cells of the images alone, and the house's own
+
+LISTED: Final = " or ".join(KINDS)
+
 MEASURED: Final = 1_000_000  # seed of the episodes that are measured; no learning begins with it
 
 
@@ -73,7 +82,8 @@ class Plan:
         out: folder of everything.
         model: checkpoint of the world model, which draws the houses.
         scene_model: run or folder of the scene model; ``scene`` for the packaged one.
-        memories: adapters of the model, and ``simulator`` for practice in the true house.
+        memories: adapters of the model, and ``simulator`` for practice in the true house. An adapter of scenes may name
+            the scene's cells, as in ``scene:seen``; see ``KINDS``.
         houses: number of held-out houses.
         first: number of the first of them in the test split.
         seeds: learnings in each house and memory, each with another scene.
@@ -105,10 +115,20 @@ class Plan:
         """The houses as ``collect`` takes them."""
         return f"{self.first}:{self.first + self.houses}"
 
-    def draws_scenes(self, memory: str) -> bool:
-        """Whether the memory that an adapter draws is a scene; ``CheckpointError`` when there is no such adapter."""
-        kind = adapter_memory(find_checkpoint(Path(self.model)), memory).name
-        return issubclass(load_plugin("memory", kind), Scene)
+    def imagines(self, memory: str) -> bool:
+        """Whether a memory is a scene that the scene model completes.
+
+        Raises:
+            PersistError: when there is no such adapter, or kind of scene.
+        """
+        if memory == SIMULATOR:
+            return False
+        adapter, colon, kind = memory.partition(":")
+        name = adapter_memory(find_checkpoint(Path(self.model)), adapter).name
+        is_scene = issubclass(load_plugin("memory", name), Scene)
+        if colon and not (is_scene and kind in KINDS):
+            raise PersistError(f"--memories {memory}: write an adapter of scenes before the colon, {LISTED} after it")
+        return is_scene and not colon
 
 
 @dataclass(frozen=True)
@@ -118,7 +138,7 @@ class Learning:
     Args:
         plan: its plan.
         house: number of the house in the test split.
-        memory: an adapter, or ``simulator``.
+        memory: an adapter, perhaps with the kind of its scene, or ``simulator``.
         seed: of the scene and of the policy.
     """
 
@@ -128,15 +148,23 @@ class Learning:
     seed: int
 
     @property
+    def adapter(self) -> str:
+        """The adapter that draws the memory."""
+        return self.memory.partition(":")[0]
+
+    @property
     def result_file(self) -> Path:
         """The file of what came of it; it is there when the learning is done."""
-        return self.plan.out / "learned" / self.memory / f"house-{self.house}-seed-{self.seed}.json"
+        return self._folder("learned") / f"house-{self.house}-seed-{self.seed}.json"
 
     @property
     def memory_file(self) -> Path:
-        """The file of the memory: each seed has another scene, but the same map."""
-        seed = f"-seed-{self.seed}" if self.plan.draws_scenes(self.memory) else ""
-        return self.plan.out / "memories" / self.memory / f"house-{self.house}{seed}.safetensors"
+        """The file of the memory: each seed imagines another scene, but has the same map."""
+        seed = f"-seed-{self.seed}" if self.plan.imagines(self.memory) else ""
+        return self._folder("memories") / f"house-{self.house}{seed}.safetensors"
+
+    def _folder(self, of: str) -> Path:
+        return self.plan.out / of / self.memory.replace(":", "-")
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -175,8 +203,7 @@ def identity(plan: Plan) -> dict[str, Any]:
         "scenes": plan.scenes, "frames": FRAMES, "steps": plan.steps, "envs": plan.envs, "episodes": plan.episodes,
         "denoising_steps": plan.denoising_steps, "images": plan.images, "goals": plan.goals,
     }  # fmt: skip
-    scenes = [memory for memory in plan.memories if memory != SIMULATOR and plan.draws_scenes(memory)]
-    if scenes:
+    if any([plan.imagines(memory) for memory in plan.memories]):  # a list, for all of them are checked
         fingerprint = find_scene_model(plan.scene_model).fingerprint
         described["scene_model"] = {"path": plan.scene_model, "fingerprint": fingerprint}
     return described
@@ -196,20 +223,39 @@ def learn(learning: Learning) -> None:
     """Make the memory of a house's images, unless it is there, learn in it, and keep what came of it."""
     image = images_of(learning)
     say(f"\nhouse {learning.house}, {learning.memory}, seed {learning.seed}: learning from {image}")
-    if learning.memory != SIMULATOR and not learning.memory_file.is_file():
-        learning.memory_file.parent.mkdir(parents=True, exist_ok=True)
-        run_line(memorize_line(learning, image))
+    if learning.memory != SIMULATOR:
+        make_memory(learning, image)
     begun = time.perf_counter()
     outcome = practise(learning, image)
     write_json(learning.result_file, {"image": image, **outcome, "seconds": time.perf_counter() - begun})
 
 
-def images_of(learning: Learning) -> str:
-    """Return the given frames of a house; of one alone its mean depth is the largest: as much as one image can show."""
-    views = learning.plan.out / VIEWS
+def make_memory(learning: Learning, image: str) -> None:
+    """Make the memory of the given images, unless it is there."""
+    file = learning.memory_file
+    if file.is_file():
+        return
+    file.parent.mkdir(parents=True, exist_ok=True)
+    if learning.memory.endswith(":true"):
+        seen = replace(learning, memory=f"{learning.adapter}:seen")
+        make_memory(seen, image)
+        scene = as_scene(load_memory(seen.memory_file))
+        scene.add(walk_of(learning).cells(0))
+        scene.save(file)
+    else:
+        run_line(memorize_line(learning, image))
+
+
+def walk_of(learning: Learning) -> TrajectoryFile:
+    """Return the walk that was collected in a house."""
     scenes = f"{learning.house}:{learning.house + 1}"
     [seed] = CollectPlan(simulator="miniworld", scenes=scenes, split="test").generator_seeds
-    file = next(file for file in Store(views) if file.info.source["house"] == seed)
+    return next(file for file in Store(learning.plan.out / VIEWS) if file.info.source["house"] == seed)
+
+
+def images_of(learning: Learning) -> str:
+    """Return the given frames of a house; of one alone its mean depth is the largest: as much as one image can show."""
+    views, file = learning.plan.out / VIEWS, walk_of(learning)
     if learning.plan.images > 1:
         return f"{views}#{file.name}:0-{learning.plan.images}"
     depth = file.read().observations.depth
@@ -219,9 +265,9 @@ def images_of(learning: Learning) -> str:
 def memorize_line(learning: Learning, image: str) -> str:
     """Return the command that makes a memory of the given images, as the adapter reads it."""
     plan = learning.plan
-    kind = adapter_memory(find_checkpoint(Path(plan.model)), learning.memory).name
+    kind = adapter_memory(find_checkpoint(Path(plan.model)), learning.adapter).name
     line = f"memorize {shlex.quote(image)} --checkpoint {shlex.quote(plan.model)} --memory {kind} "
-    if plan.draws_scenes(learning.memory):
+    if plan.imagines(learning.memory):
         line += f"--model {shlex.quote(plan.scene_model)} --complete --seed {learning.seed} "
     return f"{line}--out {shlex.quote(str(learning.memory_file))}"
 
@@ -277,7 +323,7 @@ def imagined_house(learning: Learning, image: str) -> Any:
 
     plan = learning.plan
     return gymnasium.make_vec(
-        "persist/ImaginedHouse-v0", num_envs=plan.envs, checkpoint=plan.model, adapter=learning.memory, start=image,
+        "persist/ImaginedHouse-v0", num_envs=plan.envs, checkpoint=plan.model, adapter=learning.adapter, start=image,
         memory=str(learning.memory_file), goal=plan.goals,
         sampling={"steps": plan.denoising_steps, "memory_guidance": 1.0}, **TASK,
     )  # fmt: skip
@@ -356,7 +402,10 @@ def parse(arguments: Sequence[str]) -> Plan:
     parser.add_argument("out", nargs="?", type=Path, default=Path("runs/scene-agents"))
     parser.add_argument("--model", default=REFERENCE, help="checkpoint of the world model")
     parser.add_argument("--scene-model", default=PACKAGED, help="run or folder of the trained scene model")
-    parser.add_argument("--memories", default=f"scene,voxel,{SIMULATOR}", help="adapters, and simulator")
+    parser.add_argument(
+        "--memories", default=f"scene,voxel,{SIMULATOR}",
+        help="adapters, of scenes also as scene:seen and scene:true, and simulator",
+    )  # fmt: skip
     parser.add_argument("--houses", type=int, default=12)
     parser.add_argument("--first", type=int, default=FIRST, help="number of the first house of the test split")
     parser.add_argument("--seeds", type=int, default=3, help="learnings in each house and memory")

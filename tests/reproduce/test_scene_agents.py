@@ -8,18 +8,24 @@ import shlex
 from pathlib import Path
 
 import pytest
+import torch
 
+from persist_cli.api.cells import CellOrigin
 from persist_cli.errors import CheckpointError, PersistError
 from persist_cli.io.files import write_json
+from persist_cli.memorize.memory_file import load_memory
 from persist_cli.reproduce import scene_agents
 from persist_cli.reproduce.scene_agents import (
     Learning,
     Plan,
+    images_of,
     main,
+    make_memory,
     memorize_line,
     practise,
     summarise,
     table,
+    walk_of,
     write_results,
 )
 from tests.support.micro_runs import run_persist
@@ -97,6 +103,24 @@ def test_of_one_image_the_farthest_is_taken_and_of_several_the_first_of_the_walk
         assert re.fullmatch(r".*#house-1000400" + frames, learned["image"])
 
 
+def test_a_scene_may_hold_what_the_image_shows_alone_or_the_true_cells_of_the_house(
+    plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_world()
+    monkeypatch.setattr(scene_agents, "FRAMES", 4)
+    run_persist(*shlex.split(f"collect miniworld --out '{plan.out}/views' --scenes 400:401 --frames 4 --split test"))
+    seen, true, imagined = (Learning(plan, 400, name, 1) for name in ("scene:seen", "scene:true", "scene"))
+    for learning in (true, imagined):
+        make_memory(learning, images_of(learning))
+    cells = {one: load_memory(one.memory_file).cells for one in (seen, true, imagined)}
+    house = walk_of(true).cells(0)
+    there = cells[true].box(house.corner, house.shape)
+    assert torch.equal(there.classes[house.known], house.classes[house.known])
+    origins = {one: set(cells[one].origins[cells[one].known].tolist()) for one in (seen, imagined)}
+    assert (origins[seen], len(origins[imagined])) == ({int(CellOrigin.OBSERVED)}, 2)
+    assert int(cells[seen].known.sum()) < int(cells[true].known.sum())
+
+
 def test_houses_that_are_done_in_every_memory_stand_in_the_table_and_the_scene_is_compared_with_the_map(
     plan: Plan,
 ) -> None:
@@ -147,6 +171,11 @@ def test_in_a_scene_that_shuts_the_agent_in_nothing_is_learned_and_the_reason_is
         (["--memories", " , "], "must be at least one each"),
         (["--images", "25"], "--images 25: give 1 to 24, the frames of the walk"),
         (["--memories", "scenes"], "no memory adapter 'scenes' in it"),
+        (
+            ["--memories", "scene:all"],
+            "--memories scene:all: write an adapter of scenes before the colon, seen or true",
+        ),
+        (["--memories", "voxel:seen"], "--memories voxel:seen: write an adapter of scenes before the colon"),
         (["--scene-model", "nowhere"], "nowhere"),
     ],
 )
