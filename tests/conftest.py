@@ -23,8 +23,10 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ["PERSIST_REFERENCE"] = os.devnull  # tests bring their own model, unless they test the packaged one
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # micro models are slower on many threads than on one
 torch.set_num_threads(1)
-if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # in a background job of a shell; commands would inherit it
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+for name, handler in (("SIGINT", signal.default_int_handler), ("SIGHUP", signal.SIG_DFL)):
+    number = getattr(signal, name, None)  # Windows has no SIGHUP
+    if number is not None and signal.getsignal(number) == signal.SIG_IGN:  # in a background job, and under nohup
+        signal.signal(number, handler)  # or the commands of tests would inherit it
 
 
 DIFFUSERS_MARKERS = (  # of diffusers' own tests, which test_diffusers_mixins runs where there is a checkout
