@@ -136,7 +136,8 @@ class ProgressLines(Progress):
     def _write(self, line: str) -> None:
         self.due = self.get_time() + LINE_EVERY
         if not self.disable:
-            sys.stderr.write(without_controls(line).replace("\n", "?") + "\n")
+            printable = "".join(letter if letter.isprintable() else "?" for letter in line)
+            sys.stderr.write(printable + "\n")
             sys.stderr.flush()
 
 

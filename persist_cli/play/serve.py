@@ -13,6 +13,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Final
 
+from persist_cli.errors import INTERRUPTED
 from persist_cli.io.files import check_folder
 from persist_cli.io.own_address import EVERYWHERE, address_of, bind, is_loopback, leave, names_of, open_browser
 from persist_cli.io.signals import caught_signals
@@ -26,7 +27,6 @@ from persist_cli.play.walking_page import walking_page
 
 LAST_CALL_SECONDS: Final = 1.0  # that a call to the model may still take when the server has ended
 LOOK_SECONDS: Final = 0.5  # after which it is looked again whether recordings are saved
-INTERRUPTED: Final = 130
 
 
 @dataclass(frozen=True, kw_only=True)

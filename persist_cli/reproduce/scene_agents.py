@@ -69,8 +69,6 @@ TRUE_AGENTS: Final = 4  # that are measured together
 
 KINDS: Final = ("seen", "true")  # of a scene: the cells of the images alone, and the house's own
 
-LISTED: Final = " or ".join(KINDS)
-
 MEASURED: Final = 1_000_000  # seed of the episodes that are measured; no learning begins with it
 
 
@@ -115,20 +113,24 @@ class Plan:
         """The houses as ``collect`` takes them."""
         return f"{self.first}:{self.first + self.houses}"
 
-    def imagines(self, memory: str) -> bool:
-        """Whether a memory is a scene that the scene model completes.
+    def check_memories(self) -> None:
+        """Raise ``PersistError`` when there is no such adapter, or kind of scene."""
+        for memory in self.memories:
+            adapter, colon, kind = memory.partition(":")
+            is_scene = memory != SIMULATOR and self.draws_scenes(adapter)
+            if colon and not (is_scene and kind in KINDS):
+                raise PersistError(
+                    f"--memories {memory}: write an adapter of scenes before the colon, {' or '.join(KINDS)} after it"
+                )
 
-        Raises:
-            PersistError: when there is no such adapter, or kind of scene.
-        """
-        if memory == SIMULATOR:
-            return False
-        adapter, colon, kind = memory.partition(":")
-        name = adapter_memory(find_checkpoint(Path(self.model)), adapter).name
-        is_scene = issubclass(load_plugin("memory", name), Scene)
-        if colon and not (is_scene and kind in KINDS):
-            raise PersistError(f"--memories {memory}: write an adapter of scenes before the colon, {LISTED} after it")
-        return is_scene and not colon
+    def draws_scenes(self, adapter: str) -> bool:
+        """Whether the memory that an adapter draws is a scene; ``CheckpointError`` when there is no such adapter."""
+        kind = adapter_memory(find_checkpoint(Path(self.model)), adapter).name
+        return issubclass(load_plugin("memory", kind), Scene)
+
+    def imagines(self, memory: str) -> bool:
+        """Whether a memory is a scene that the scene model completes."""
+        return memory != SIMULATOR and ":" not in memory and self.draws_scenes(memory)
 
 
 @dataclass(frozen=True)
@@ -203,7 +205,8 @@ def identity(plan: Plan) -> dict[str, Any]:
         "scenes": plan.scenes, "frames": FRAMES, "steps": plan.steps, "envs": plan.envs, "episodes": plan.episodes,
         "denoising_steps": plan.denoising_steps, "images": plan.images, "goals": plan.goals,
     }  # fmt: skip
-    if any([plan.imagines(memory) for memory in plan.memories]):  # a list, for all of them are checked
+    plan.check_memories()
+    if any(map(plan.imagines, plan.memories)):
         fingerprint = find_scene_model(plan.scene_model).fingerprint
         described["scene_model"] = {"path": plan.scene_model, "fingerprint": fingerprint}
     return described
