@@ -223,11 +223,7 @@ def summary(report: Mapping[str, Any], files: Mapping[str, str], camera_named: b
     lines = [f"{count} edit{'s' * (count > 1)} changed {report['changed']:,} cells of {report['scene']}"]
     if uncovered:
         lines.append(f"{uncovered:,} of these were never seen before; {FILLED[report['filled_by']]}")
-    lines += [
-        f"{title} from {report['view']}: pixels that look at the edit change by {change['inside']:.3g} of 255 on "
-        f"average, others by {change['outside']:.3g}"
-        for title, change in report["pictures"].items()
-    ]
+    lines += [f"{title} from {report['view']}: {_change(change)}" for title, change in report["pictures"].items()]
     if "views" not in files:
         camera = "" if camera_named else "--camera DATA#trajectory:frame says from where, and "
         lines.append(f"no view is drawn; {camera}--checkpoint names the model that draws it")
@@ -279,3 +275,11 @@ def _point(point: tuple[float, float, float]) -> str:
 
 def _color(color: tuple[int, int, int]) -> str:
     return "#" + "".join(f"{shade:02x}" for shade in color)
+
+
+def _change(change: Mapping[str, float]) -> str:
+    """Return in words how a picture changed; nothing looks at an edit that is out of view or hidden."""
+    if not change["share"]:
+        return "no pixel looks at the edit; --camera DATA#trajectory:frame names another view"
+    others = f", others by {change['outside']:.3g}" if change["share"] < 1 else ""
+    return f"pixels that look at the edit change by {change['inside']:.3g} of 255 on average{others}"

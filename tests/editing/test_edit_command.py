@@ -1,6 +1,7 @@
 """``persist edit`` changes scenes and voxel maps, and shows them before and after."""
 
 import json
+import math
 
 import pytest
 import torch
@@ -8,6 +9,7 @@ from PIL import Image
 
 from persist_cli.api.cells import FREE, CellOrigin
 from persist_cli.api.memory import FrameOfReference
+from persist_cli.editing.edit import summary
 from persist_cli.memorize.memory_file import load_memory, load_paths
 from persist_cli.plugins import make_encoder, make_memory
 from tests.support.cell_rooms import TABLE_CELLS, UP, camera_at, cell_room
@@ -54,6 +56,21 @@ def test_edits_are_done_in_the_order_of_the_command_line_and_shown(persist, room
     assert {path.name for path in tmp_path.iterdir()} == names
     assert Image.open(tmp_path / "edited-views.png").width > 500
     assert torch.equal(load_paths(out)["walk"], load_paths(room)["walk"])
+
+
+@pytest.mark.parametrize(
+    ("share", "words"),
+    [
+        (0, "no pixel looks at the edit; --camera DATA#trajectory:frame names another view"),
+        (0.5, "pixels that look at the edit change by 20 of 255 on average, others by 1"),
+        (1, "pixels that look at the edit change by 20 of 255 on average"),
+    ],
+)
+def test_the_summary_says_what_changes_where_pixels_look_at_the_edit(share, words):
+    change = {"inside": 20.0 if share else math.nan, "outside": math.nan if share == 1 else 1.0, "share": share}
+    report = {"uncovered": 0, "edits": [{}], "changed": 9, "scene": "room", "view": "house#0:2"}
+    text = summary(report | {"pictures": {"cells": change}}, {"views": "views.png"}, camera_named=True)
+    assert f"cells from house#0:2: {words}" in text.splitlines()
 
 
 def test_a_file_of_edits_gives_the_same_memory_to_the_bit(persist, room, tmp_path):
