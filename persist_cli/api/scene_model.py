@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Float, Int64, UInt8
+from jaxtyping import Bool, Float, Int64, UInt8
 from torch import Tensor, nn
 
 from persist_cli.api.cells import CellForm, CellGrid
@@ -61,6 +61,7 @@ class SceneSamples:
         carried_color: its colour, uint8 RGB.
         true_classes: what the cells hold; ``None`` outside of training.
         true_colors: their colours; ``None`` outside of training.
+        true_known: of which cells the data say what they hold, and the others are ``OUTSIDE``; ``None`` for all.
         seeds: seed of all random numbers of each sample.
     """
 
@@ -77,6 +78,7 @@ class SceneSamples:
     seeds: Int64[Tensor, "*batch"]
     true_classes: UInt8[Tensor, "*batch first second level"] | None = None
     true_colors: UInt8[Tensor, "*batch first second level 3"] | None = None
+    true_known: Bool[Tensor, "*batch first second level"] | None = None
 
     def tensors(self) -> dict[str, Tensor]:
         """Return all tensors by name, without those that are ``None``."""

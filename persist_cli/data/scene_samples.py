@@ -5,11 +5,10 @@ Sample n depends on the seed and on n only. What is known is what a scene knows 
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 import torch
@@ -18,10 +17,11 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from persist_cli.api.cell_things import STRUCTURE
-from persist_cli.api.cells import COMMON, FREE, OUTSIDE, SOLID, CellGrid, CellOrigin
+from persist_cli.api.cells import COMMON, FREE, SOLID, CellGrid
 from persist_cli.api.reach import cells_in_reach
 from persist_cli.api.scene_model import Given, SceneForm, SceneSamples, no_view, window_pose
 from persist_cli.api.scene_turns import Turn
+from persist_cli.data.scene_truth import DROP, NOTHING, PICK_UP, Carried, Interaction, SceneTruths, settled
 from persist_cli.data.store import Store, TrajectoryFile
 from persist_cli.data.written_scenes import SceneWriter, TensorStore, WrittenScene
 from persist_cli.errors import DataError
@@ -31,9 +31,6 @@ STRIDES: Final = 4  # from frame to frame of these, at most
 FIXED: Final = 8  # single frames and as many walks that each trajectory offers, so that they come again and are kept
 JITTER: Final = 8  # cells that a window may lie beside the camera; of kind grown it lies anywhere around it
 TRIES: Final = 16  # of finding a trajectory with interactions
-TRUTHS_KEPT: Final = 64  # grids of the latest trajectories
-PICK_UP, DROP = "pick_up", "drop"
-BESIDE: Final = ((0, 0, -1), (0, 0, 1), (-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0))
 
 
 @dataclass(frozen=True)
@@ -61,23 +58,6 @@ class SampleShares:
     idle: float = 0.15
 
 
-class Carried(NamedTuple):
-    """What the agent carries: class, 0 for nothing, and mean RGB."""
-
-    kind: int
-    color: tuple[int, int, int]
-
-
-class Interaction(NamedTuple):
-    """An interaction at a frame of a trajectory."""
-
-    frame: int
-    action: str
-
-
-NOTHING: Final = Carried(0, (0, 0, 0))
-
-
 @dataclass(frozen=True)
 class Window:
     """One sample before it is turned and mirrored.
@@ -85,7 +65,7 @@ class Window:
     Args:
         given: the ``Given`` of each cell.
         seen: what is given.
-        truth: what the cells hold.
+        truth: what the cells hold, as far as it is known.
         scene: gives the view.
         action: name of the interaction, empty for none.
         carried: what the agent carries before it.
@@ -105,14 +85,15 @@ class SceneSampleDataset(Dataset[SceneSamples]):
     """Endless samples of some data sets; sample n depends on the seed and on n only.
 
     Args:
-        folders: folders of the data sets; trajectories without cells are left out.
+        folders: folders of the data sets. Trajectories without cells are left out where the form's cells have names;
+            else their cells are fused from their frames.
         form: the windows.
         seed: seed of the draws.
         shares: how often samples are of each kind.
         cache: keeps what scenes know, which takes most of the time; without it some thousand stay in memory.
 
     Raises:
-        DataError: when no trajectory has cells, or they or the images are not those of the form.
+        DataError: when no trajectory has cells that it needs, or they or the images are not those of the form.
     """
 
     def __init__(
@@ -124,17 +105,18 @@ class SceneSampleDataset(Dataset[SceneSamples]):
         cache: TensorStore | None = None,
     ) -> None:
         self.form, self.seed, self.shares = form, seed, shares or SampleShares()
-        self.files = [file for folder in folders for file in Store(folder) if file.has_cells]
+        fused = form.cells.palette == COMMON
+        self.files = [file for folder in folders for file in Store(folder) if file.has_cells or fused]
         if not self.files:
             where = " and ".join(map(str, folders))
             raise DataError(
-                f"{where}: no trajectory has the cells of its scene; `persist collect miniworld` writes them"
+                f"{where}: no trajectory has the cells of its scene; `persist collect miniworld` writes them. "
+                "fused-64-scene-codec learns from captures with depth"
             )
         for file in self.files:
             _check_form(file, form)
         self.writer = SceneWriter(form.cells, cache)
-        self._truths: OrderedDict[tuple[Path, int], CellGrid] = OrderedDict()
-        self._interactions: dict[Path, list[Interaction]] = {}
+        self.truths = SceneTruths(self.writer)
 
     def __getitem__(self, number: int) -> SceneSamples:
         random = np.random.default_rng((self.seed, number))
@@ -158,7 +140,7 @@ class SceneSampleDataset(Dataset[SceneSamples]):
         window = self._observed(file, self._frames(file, int(random.integers(2 * FIXED))), random, 1.0, grown=True)
         known = random_part(self.form.shape, random)
         seen, given = window.seen.copy(), window.given.clone()
-        fresh = known & (given == Given.NOTHING)
+        fresh = known & (given == Given.NOTHING) & window.truth.known
         for mine, true in zip(seen.tensors()[:2], window.truth.tensors()[:2], strict=True):
             mine[fresh] = true[fresh]
         given[fresh] = int(Given.CONTENT)
@@ -168,7 +150,7 @@ class SceneSampleDataset(Dataset[SceneSamples]):
         """A sample of an interaction; of a walk where the data sets have too few of them."""
         for _ in range(TRIES):
             file = self._file(random)
-            events = [event for event in self.interactions(file) if event.action in self.form.actions]
+            events = [event for event in self.truths.interactions(file) if event.action in self.form.actions]
             if events:
                 if random.random() < self.shares.idle:
                     return self._idle(file, random)
@@ -178,8 +160,7 @@ class SceneSampleDataset(Dataset[SceneSamples]):
     def _event(self, file: TrajectoryFile, event: Interaction, random: np.random.Generator) -> Window:
         """What an interaction changes; a thing that is picked up is then carried, and in no cell."""
         before = self._observed(file, self._event_frames(file, event), random, self.shares.named_acting)
-        after = around(self._truth(file, event.frame + 1), before.seen)
-        was = around(self._truth(file, event.frame), before.seen)
+        after, was = (self.truths.around(file, event.frame + later, before.seen) for later in (1, 0))
         if event.action == PICK_UP:
             appeared = after.solid & ~was.solid
             after.classes[appeared], after.colors[appeared] = FREE, 0
@@ -222,26 +203,24 @@ class SceneSampleDataset(Dataset[SceneSamples]):
         A grown one holds the camera anywhere: an agent walks on, and the view stays where it was.
         """
         scene = self.writer.scene(file, frames)
-        whole = self._truth(file, frames[-1])
-        corner = self._corner(scene, whole, random, max(self.form.shape[:2]) if grown else JITTER)
+        floor = self.truths.floor(file, frames[-1])
+        corner = self._corner(scene, floor, random, max(self.form.shape[:2]) if grown else JITTER)
         seen = scene.known.box(corner, self.form.shape)
-        truth = settled(around(whole, seen), seen)
+        truth = settled(self.truths.around(file, frames[-1], seen), seen)
         if random.random() < named:
             unnamed = seen.known & (seen.classes == SOLID)
             seen.classes[unnamed] = truth.classes[unnamed]
         given = torch.where(seen.known, int(Given.CONTENT), int(Given.NOTHING)).to(torch.uint8)
-        return Window(given, seen, truth, scene, carried=self.carried(file, frames[-1]))
+        return Window(given, seen, truth, scene, carried=self.truths.carried(file, frames[-1]))
 
-    def _corner(
-        self, scene: WrittenScene, whole: CellGrid, random: np.random.Generator, most: int
-    ) -> tuple[int, int, int]:
+    def _corner(self, scene: WrittenScene, floor: int, random: np.random.Generator, most: int) -> tuple[int, int, int]:
         """The lowest cell of a window around the camera or at most so many cells beside it, from the floor up."""
-        first, second, _ = whole.numbers(scene.view.cameras.centers[0]).tolist()
+        first, second, _ = scene.known.numbers(scene.view.cameras.centers[0]).tolist()
         most = most if random.random() < 0.5 else 0
         limits = [min(most, side // 2 - 1) for side in self.form.shape[:2]]
         by_first, by_second = (int(random.integers(-limit, limit + 1)) for limit in limits)
         rows, columns, _ = self.form.shape
-        return first - rows // 2 + by_first, second - columns // 2 + by_second, whole.corner[2]
+        return first - rows // 2 + by_first, second - columns // 2 + by_second, floor
 
     def _sample(self, window: Window, random: np.random.Generator) -> SceneSamples:
         """The sample of a window, turned so that its camera looks along the first axis, and mirrored at random.
@@ -256,6 +235,7 @@ class SceneSampleDataset(Dataset[SceneSamples]):
             "colors": window.seen.colors * known[..., None],
             "true_classes": window.truth.classes,
             "true_colors": window.truth.colors,
+            "true_known": window.truth.known,
         }
         pose, lens = window_pose(window.seen, view.cameras.world_from_camera[0]), view.cameras.intrinsics[0].double()
         turned = Turn.draw(form.shape, random)
@@ -290,84 +270,15 @@ class SceneSampleDataset(Dataset[SceneSamples]):
         """The frames of a walk up to an interaction, the same each time."""
         return _frames_up_to(event.frame, True, np.random.default_rng([self.seed, event.frame, *file.name.encode()]))
 
-    def _truth(self, file: TrajectoryFile, frame: int) -> CellGrid:
-        """The cells at a frame; those of the latest trajectories are kept."""
-        changes = [event.frame for event in self.interactions(file)]
-        key = file.path, frame if changes else 0
-        if key not in self._truths:
-            self._truths[key] = file.cells(frame)
-            while len(self._truths) > TRUTHS_KEPT:
-                self._truths.popitem(last=False)
-        self._truths.move_to_end(key)
-        return self._truths[key]
-
-    def interactions(self, file: TrajectoryFile) -> list[Interaction]:
-        """The interactions that a trajectory really did, in their order."""
-        if file.path not in self._interactions:
-            self._interactions[file.path] = interactions_of(file)
-        return self._interactions[file.path]
-
     def check_interactions(self) -> None:
         """Raise ``DataError`` when no trajectory has an interaction that the form knows."""
         known = self.form.actions
-        if not any(event.action in known for file in self.files for event in self.interactions(file)):
+        if not any(event.action in known for file in self.files for event in self.truths.interactions(file)):
             where = " and ".join(dict.fromkeys(str(file.path.parent) for file in self.files))
             raise DataError(
                 f"{where}: no trajectory has an action {', '.join(known)}; `persist collect miniworld "
                 "--policy interact` writes such"
             )
-
-    def carried(self, file: TrajectoryFile, frame: int) -> Carried:
-        """What the agent carries at a frame: what vanished from its place when it was picked up."""
-        handled = [
-            event for event in self.interactions(file) if event.frame < frame and event.action in (PICK_UP, DROP)
-        ]
-        if not handled or handled[-1].action == DROP:
-            return NOTHING
-        before, after = (self._truth(file, handled[-1].frame + later) for later in (0, 1))
-        gone = before.solid & ~after.solid
-        if not bool(gone.any()):
-            return NOTHING
-        red, green, blue = before.colors[gone].double().mean(dim=0).round().int().tolist()
-        return Carried(int(before.classes[gone].mode().values), (red, green, blue))
-
-
-def interactions_of(file: TrajectoryFile) -> list[Interaction]:
-    """The interactions that a trajectory really did, in their order."""
-    names = {action.name for action in file.info.vocabulary.actions if action.interaction}
-    return [Interaction(n, name) for n, name in enumerate(file.actions()) if name in names and name is not None]
-
-
-def around(whole: CellGrid, window: CellGrid) -> CellGrid:
-    """The cells of a whole scene in a window; what lies outside of its box is outside."""
-    part = whole.box(window.corner, window.shape)
-    part.classes[~part.known] = OUTSIDE
-    return replace(part, origins=torch.full_like(part.origins, int(CellOrigin.OBSERVED)))
-
-
-def settled(truth: CellGrid, seen: CellGrid) -> CellGrid:
-    """The truth of a window as far as what is seen allows: where the two differ, what is seen stays.
-
-    A cell that is seen solid where the truth is free has the class of a solid neighbour, else ``SOLID``. What is seen
-    solid keeps its colour.
-    """
-    result = truth.copy()
-    solid = seen.solid
-    result.classes[seen.known & ~solid], result.colors[seen.known & ~solid] = FREE, 0
-    result.classes[solid & ~truth.solid] = _classes_beside(truth, (solid & ~truth.solid).nonzero())
-    result.colors[solid] = seen.colors[solid]
-    return result
-
-
-def _classes_beside(grid: CellGrid, places: Tensor) -> UInt8[Tensor, " cell"]:
-    """The class of a solid cell beside each of some cells, ``SOLID`` where there is none."""
-    classes = torch.full((len(places),), SOLID, dtype=torch.uint8)
-    last = torch.tensor(grid.shape) - 1
-    for step in reversed(BESIDE):
-        beside = (places + torch.tensor(step)).clamp_min(0).minimum(last).unbind(1)
-        found = grid.solid[beside]
-        classes[found] = grid.classes[beside][found]
-    return classes
 
 
 def is_thing(grid: CellGrid) -> Bool[Tensor, "first second level"]:

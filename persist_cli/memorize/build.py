@@ -7,8 +7,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from jaxtyping import Float
 from torch import Tensor
 
+from persist_cli.api.cell_things import floor_level
 from persist_cli.api.memory import Memory
 from persist_cli.api.scene import Scene
 from persist_cli.errors import CheckpointError, DataError, FrameError, PersistError
@@ -19,10 +21,12 @@ from persist_cli.memorize.memory_config import MemorizePlan, resolve_memory_conf
 from persist_cli.memorize.memory_file import add_paths, load_memory, load_paths
 from persist_cli.memorize.picture import PictureOptions, is_picture, refuse_picture_options, write_picture
 from persist_cli.memorize.sources import Source, common_reference, find_sources
-from persist_cli.output.console import add_task, busy, print_json, print_table, progress, say, watched
+from persist_cli.output.console import add_task, busy, print_json, print_table, progress, say, warn, watched
 from persist_cli.output.map import draw_map
 from persist_cli.plugins import load_plugin, make_encoder, make_memory
 from persist_cli.recipe import MemoryConfig
+
+NEAR_FLOOR = 2  # cells: no camera is expected lower, and the floor that was seen may be so far off
 
 
 def run_memorize(data: list[str], plan: MemorizePlan, picture: PictureOptions, out: Path, json: bool) -> None:
@@ -54,6 +58,8 @@ def run_memorize(data: list[str], plan: MemorizePlan, picture: PictureOptions, o
         add_paths(paths, {source.file.name: source.file.poses()[source.frames.start : source.frames.stop]})
     extra = {"frames": frames, "frames_per_second": frames / seconds, "settings_of": origin}
     if scene is not None:
+        newest = sources[-1]
+        _check_floor(scene, config, newest.file.poses()[newest.frames[-1]])
         began = time.perf_counter()
         with busy("imagining"):
             seed = config.settings.get("seed", 0) if plan.seed is None else plan.seed
@@ -103,6 +109,22 @@ def imagining_scene(memory: Memory) -> Scene:
     assert isinstance(memory, Scene)
     memory.model()
     return memory
+
+
+def _check_floor(scene: Scene, config: MemoryConfig, world_from_camera: Float[Tensor, "4 4"]) -> None:
+    """Warn where a camera stands on or below the floor of what will be imagined, or above its ceiling."""
+    level, form = floor_level(scene.cells), scene.model().form
+    if level is None:
+        return
+    size, floor = form.cells.size, config.settings.get("floor", 0.0)
+    seen = (scene.cells.corner[2] + level) * size
+    height = float(scene.cells.axes[2] @ world_from_camera[:3, 3].double())
+    near = NEAR_FLOOR * size
+    if not near < height - floor < form.shape[2] * size and abs(seen - floor) > near:
+        warn(
+            f"warning: what is imagined has its floor at {floor:g} m along up, and the camera is at {height:.2f} m; "
+            f"what was seen has its floor near {seen:g} m: --set memory.floor={seen:g}"
+        )
 
 
 def run_merge(paths: list[Path], out: Path, json: bool) -> None:

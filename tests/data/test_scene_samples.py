@@ -26,16 +26,27 @@ from tests.support.miniworlds import make_world
 from tests.support.noise import INFO, make_frames
 
 WINDOW = SceneForm(FORM, (40, 40, 12), (32, 32))
+UNNAMED = replace(WINDOW, cells=CellForm(FORM.size))  # of captures, which know no classes
 KINDS = [field.name for field in fields(SampleShares) if field.name not in ("named", "named_acting", "unseen", "idle")]
 
 
 @pytest.fixture(scope="session")
 def houses(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two houses in which an agent interacts."""
-    folder, world = tmp_path_factory.mktemp("houses"), make_world(height=32, width=32)
+    return write_walks(tmp_path_factory.mktemp("houses"))
+
+
+@pytest.fixture(scope="session")
+def captures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same walks as captures, which know nothing of the cells of their houses."""
+    return write_walks(tmp_path_factory.mktemp("captures"), cells=None)
+
+
+def write_walks(folder: Path, **changes: Any) -> Path:
+    world = make_world(height=32, width=32)
     plan = CollectPlan(simulator="miniworld", scenes="0:10", frames=48, size="32x32", policy="interact")
     for seed in (9001, 9002):
-        frames = collect_frames(world, plan, seed)
+        frames = (replace(frame, **changes) for frame in collect_frames(world, plan, seed))
         write_trajectory(folder / f"house-{seed}.parquet", world.info, frames)
     return folder
 
@@ -197,8 +208,42 @@ def test_a_cache_keeps_what_scenes_know_and_changes_no_sample(houses: Path) -> N
 
 def test_data_without_cells_are_refused(tmp_path: Path) -> None:
     write_trajectory(tmp_path / "one.parquet", INFO, make_frames(4))
-    with pytest.raises(DataError, match="no trajectory has the cells of its scene; `persist collect miniworld` writes"):
+    with pytest.raises(DataError, match=r"no trajectory has the cells of its scene; .* fused-64-scene-codec learns"):
         SceneSampleDataset([tmp_path], WINDOW, 0)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_of_a_capture_only_what_its_frames_show_is_known(captures: Path, kind: str) -> None:
+    only = {name: float(name == kind) for name in KINDS}
+    dataset = SceneSampleDataset([captures], UNNAMED, 5, SampleShares(**only))
+    for number in range(4):
+        sample = dataset[number]
+        classes, known = truths(sample)[0], sample.true_known
+        assert known is not None
+        assert 0.02 < known.float().mean() < 0.9
+        assert bool(known[sample.given > 0].all())
+        assert set(classes[known].tolist()) == {FREE, SOLID}
+        assert bool((classes[~known] == OUTSIDE).all())
+        assert int(sample.action) == 0
+
+
+def test_fused_cells_are_those_of_the_house_as_far_as_they_are_known(houses: Path, captures: Path) -> None:
+    fused, stored = SceneSampleDataset([captures], UNNAMED, 0), SceneSampleDataset([houses], WINDOW, 0)
+    for capture, house in zip(fused.files, stored.files, strict=True):
+        seen, whole = fused.truths.at(capture, 0), house.cells(0)
+        true = whole.box(seen.corner, seen.shape)
+        agree = (seen.solid == true.solid)[seen.known & true.known]
+        assert int(seen.known.sum()) > 1000
+        assert float(agree.float().mean()) > 0.97
+        assert fused.truths.floor(capture, 0) == stored.truths.floor(house, 0) == 0
+
+
+def test_a_capture_without_depth_is_refused(tmp_path: Path) -> None:
+    blind = [replace(frame, depth=np.zeros_like(frame.depth)) for frame in make_frames(4)]
+    write_trajectory(tmp_path / "one.parquet", INFO, blind)
+    form = replace(UNNAMED, image=(INFO.height, INFO.width))
+    with pytest.raises(DataError, match=r"one\.parquet: no frame has depth, so that nothing is known of its cells"):
+        SceneSampleDataset([tmp_path], form, 0)[0]
 
 
 @pytest.mark.parametrize(

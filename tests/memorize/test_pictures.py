@@ -113,6 +113,17 @@ def test_frames_of_data_are_completed_too_and_their_map_shows_what_is_imagined(m
     assert again.read_bytes() != drawn
 
 
+@pytest.mark.parametrize("floor", [0.0, 1.2, -4.0])
+def test_a_floor_that_is_none_is_said_with_the_one_that_was_seen(persist, model, tmp_path, floor):
+    Room(32, 32).write(tmp_path / "data" / "a.parquet", np.stack([look((0.0, 1.25, 0.0), 0.0, 0.0)] * 2))
+    arguments = ("--model", model, "--complete", "--set", f"memory.floor={floor}", "--out", tmp_path / "a.safetensors")
+    result = persist("memorize", f"{tmp_path}/data#0:0", *arguments)
+    assert result.code == 0, result.err
+    warned = f"what is imagined has its floor at {floor:g} m along up, and the camera is at 1.25 m"
+    assert (warned in result.err) == (floor != 0)
+    assert ("--set memory.floor=0\n" in result.err) == (floor != 0)
+
+
 def test_a_second_picture_takes_the_place_of_the_first_one(hall, tmp_path, capsys):
     other = tmp_path / "another.png"
     other.write_bytes((hall / "hall.png").read_bytes())

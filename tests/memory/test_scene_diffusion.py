@@ -83,6 +83,25 @@ def test_a_loss_does_not_depend_on_how_samples_are_batched(model, samples, stage
     assert model(samples, stage)["loss"].equal(model(samples, stage)["loss"])
 
 
+@pytest.mark.parametrize("stage", ["scene-codec", "scene"])
+def test_what_the_data_do_not_tell_counts_as_little_as_the_settings_say(samples, stage):
+    """The mean over all cells is that of two halves of them, each of which was told alone."""
+    told = torch.zeros(samples.given.shape, dtype=torch.bool)
+    told[:, :8] = True  # whole tokens
+    parts = [replace(samples, true_known=known) for known in (told, ~told, torch.ones_like(told))]
+    name = {"scene-codec": "cross_entropy", "scene": "loss"}[stage]
+
+    def losses(weight):
+        model = micro_model(untold_weight=weight, codec=MICRO_SCENE["codec"] | {"rare_weight": 1.0})
+        return [model(part, stage)[name].item() for part in (*parts, samples)]
+
+    one, other, both, plain = losses(0.0)
+    assert one != pytest.approx(other, rel=1e-4)
+    assert both == plain == pytest.approx((one + other) / 2, rel=1e-5)
+    assert losses(0.25)[0] == pytest.approx((one + 0.25 * other) / 1.25, rel=1e-5)
+    assert losses(1.0)[0] == pytest.approx(both, rel=1e-5)
+
+
 def test_each_stage_trains_its_own_part_and_all_parts_are_named_once(model, samples):
     codec, rest, outcomes = (set(model.trained_parameters(stage)) for stage in SCENE_STAGES)
     assert not codec & rest | codec & outcomes | rest & outcomes

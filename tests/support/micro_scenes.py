@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -57,8 +58,8 @@ def micro_samples(count: int, form: SceneForm | None = None, stacked: bool = Tru
     return SceneSamples.stack(samples) if stacked else samples
 
 
-def write_scenes(folder: Path, frames: int = 4) -> Path:
-    """Write two trajectories with the cells of their houses; the agent is anywhere at each frame."""
+def write_scenes(folder: Path, frames: int = 4, stored: bool = True) -> Path:
+    """Write two trajectories, with the cells of their houses if stored; the agent is anywhere at each frame."""
     form = micro_model().form
     for number in range(2):
         classes, colors = random_window(form.shape, number)
@@ -70,8 +71,9 @@ def write_scenes(folder: Path, frames: int = 4) -> Path:
             pose, lens = random_camera(classes, form, draw)
             rgb = torch.randint(0, 256, (*form.image, 3), generator=draw, dtype=torch.uint8)
             depth = see(classes, form, pose, lens)[1]
-            views.append(Frame(rgb.numpy(), depth.numpy(), pose.double().numpy(), "forward", float(frame), cells))
+            views.append(Frame(rgb.numpy(), depth.numpy(), pose.double().numpy(), "forward", float(frame)))
         info = TrajectoryInfo(f"house-{number}", lens.double(), *form.image, UP, walking_actions(0.25, 15.0))
+        views = [replace(view, cells=cells) for view in views] if stored else views
         write_trajectory(folder / f"house-{number}.parquet", info, views)
     return folder
 

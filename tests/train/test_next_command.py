@@ -37,6 +37,13 @@ def test_a_scene_model_is_measured_next_with_a_data_set_of_its_training(tmp_path
     assert "--train one --out" in command
 
 
+def test_a_scene_model_of_captures_completes_one_next_since_no_data_can_measure_it(tmp_path):
+    recipe = make_recipe(read_recipe("fused-64-scene") | {"data": {"path": ["one", "two"]}}, "fused-64-scene")
+    command = next_command("fused-64-scene", recipe, tmp_path)
+    parse_line(command.removeprefix("persist "))
+    assert command == f"persist memorize one#0:0 --memory scene --model {tmp_path} --complete"
+
+
 def test_names_with_spaces_are_quoted():
     values = {"stage": "1", "data": {"path": "my houses"}}
     command = next_command("houses-64-stage1", make_recipe(values, "houses-64-stage1"), Path("runs/my model"))

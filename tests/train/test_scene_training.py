@@ -8,11 +8,13 @@ from dataclasses import asdict
 
 import pytest
 
+from persist_cli.api.cells import COMMON
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.scene_model import SceneSamples
 from persist_cli.checkpoints.scene_models import find_scene_model
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import read_tensors
+from persist_cli.memorize.memory_file import load_memory
 from persist_memory.scene_models.scene_diffusion import SceneDiffusion
 from tests.support.cell_houses import FORM, write_cell_houses, write_interactions
 from tests.support.micro_runs import equal_runs, losses, run_persist
@@ -69,6 +71,20 @@ def test_the_second_stage_keeps_the_codec_of_its_base_with_the_scale_of_its_late
     assert codec.keys() == kept.keys()
     assert all(codec[name].equal(kept[name]) for name in codec)
     assert (codec["codec.latent_deviation"] != 1).all()
+
+
+def test_captures_without_cells_train_a_model_that_completes_them(persist, tmp_path):
+    folder, unnamed = tmp_path / "captures", f"{PALETTE}={json.dumps(COMMON)}"
+    folder.mkdir()
+    write_scenes(folder, stored=False)
+    run_persist(*scene_stage("tiny-scene-codec", folder, tmp_path / "codec", unnamed))
+    run_persist(*scene_stage("tiny-scene", folder, tmp_path / "scene", f"base={tmp_path / 'codec'}", unnamed))
+    assert len(losses(tmp_path / "scene")) == 4
+    out = tmp_path / "made.safetensors"
+    made = persist("memorize", f"{folder}#0:0", "--model", tmp_path / "scene", "--complete", "--out", out, "--json")
+    assert made.code == 0, made.err
+    assert json.loads(made.out)["imagined"] > 500
+    assert load_memory(out).cells.form.palette == COMMON
 
 
 @pytest.mark.parametrize("name", ["codec", "scene"])

@@ -16,8 +16,10 @@ from persist_cli.errors import CheckpointError
 from persist_memory.scene_models.codec import (
     COLORS,
     cells_of_a_token,
+    channels_first,
     convolution,
     every_cell,
+    fold,
     folded_tokens,
     unfold,
 )
@@ -214,6 +216,19 @@ def truth(samples: SceneSamples) -> tuple[Tensor, Tensor]:
     if samples.true_classes is None or samples.true_colors is None:
         raise CheckpointError("a model of scenes is trained on samples with true cells, these have none")
     return samples.true_classes, samples.true_colors
+
+
+def told_weights(samples: SceneSamples, settings: SceneDiffusionSettings) -> Float[Tensor, "batch first second level"]:
+    """Return what cells count in training: 1 where the data say what they hold, ``untold_weight`` elsewhere."""
+    if samples.true_known is None:
+        return torch.ones(samples.given.shape, device=samples.given.device)
+    return samples.true_known.float().clamp_min(settings.untold_weight)
+
+
+def token_weights(samples: SceneSamples, settings: SceneDiffusionSettings) -> Float[Tensor, "batch token"]:
+    """Return what tokens count in training: the mean of their cells."""
+    blocks = channels_first(told_weights(samples, settings)[..., None], len(settings.divided))
+    return fold(blocks, cells_of_a_token(settings)).mean(dim=1).flatten(1)
 
 
 def changed_cells(samples: SceneSamples) -> Bool[Tensor, "batch first second level"]:

@@ -40,6 +40,8 @@ from persist_memory.scene_models.conditions import (
     draw_levels,
     known_tokens,
     shifted,
+    token_weights,
+    told_weights,
     truth,
 )
 from persist_memory.scene_models.outcome import Outcome
@@ -106,7 +108,7 @@ class SceneDiffusion(SceneModel):
         return self._code(samples, generators) if stage == "scene-codec" else self._diffuse(samples, generators)
 
     def _code(self, samples: SceneSamples, generators: list[torch.Generator]) -> dict[str, Tensor]:
-        """The loss of the codec, each part a mean over cells."""
+        """The loss of the codec, each part a mean over cells, in which those that the data do not tell count less."""
         classes, colors = truth(samples)
         mean, logarithm = (part.float() for part in self.codec.posterior(classes, colors))
         drawn = mean + (0.5 * logarithm).exp() * noise_like(mean, generators)
@@ -114,7 +116,9 @@ class SceneDiffusion(SceneModel):
         share = self.settings.codec.noise
         noisy = (1 - share) * drawn + share * spread * noise_like(mean, generators)
         logits, predicted = self.codec.read_off(noisy)
-        cross_entropy = F.cross_entropy(logits.flatten(0, 3), classes.flatten().long(), weight=self.weights)
+        surprise = F.cross_entropy(logits.flatten(0, 3), classes.flatten().long(), reduction="none")
+        weights = self.weights[classes.flatten().int()] * told_weights(samples, self.settings).flatten()
+        cross_entropy = (surprise * weights).sum() / weights.sum()
         solid = is_solid(classes)
         color_error = ((predicted - colors / 255).abs().mean(-1) * solid).sum() / solid.sum().clamp_min(1)
         divergence = 0.5 * (mean**2 + logarithm.exp() - 1 - logarithm).sum() / classes.numel()
@@ -128,7 +132,7 @@ class SceneDiffusion(SceneModel):
         }  # fmt: skip
 
     def _diffuse(self, samples: SceneSamples, generators: list[torch.Generator]) -> dict[str, Tensor]:
-        """The squared error of the velocities of all tokens that are not known."""
+        """The squared error of the velocities of all tokens that are not known; less of what the data do not tell."""
         known = known_tokens(samples, self.settings)
         levels = draw_levels(self.settings, generators).to(known.device).masked_fill(known, 0.0)
         held = self._held(samples)
@@ -141,6 +145,7 @@ class SceneDiffusion(SceneModel):
             velocity = self.transformer(noisy, levels, told.given, told.view, told.action).float()
         errors = self._tokens(velocity - (noise - latents)).square().mean(-1)
         weights = (~known).float()
+        weights *= token_weights(samples, self.settings)
         weights *= 1 + (self.settings.transformer.change_weight - 1) * changed_tokens(samples, self.settings)
         loss = (errors * weights).sum() / weights.sum().clamp_min(1)
         return {"loss": loss, "known_tokens": known.float().mean()}

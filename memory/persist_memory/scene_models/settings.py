@@ -134,6 +134,7 @@ class SceneDiffusionSettings:
         shape: cells along the two ground axes and up; multiples of 4 (the height only where levels are not folded).
         image: height and width of the view in pixels.
         actions: names of the interactions that it knows.
+        untold_weight: of cells, in training, whose content the data do not say; they are taken for ``outside``.
         codec: the codec.
         transformer: the transformer.
         outcome: the network that says what interactions change.
@@ -145,6 +146,7 @@ class SceneDiffusionSettings:
     shape: tuple[Positive, Positive, Positive] = (64, 64, 12)
     image: tuple[Positive, Positive] = (64, 64)
     actions: tuple[str, ...] = ("pick_up", "drop", "toggle")
+    untold_weight: Annotated[float, Field(ge=0, le=1)] = 0.1
     codec: CodecSettings = field(default_factory=CodecSettings)
     transformer: TransformerSettings = field(default_factory=TransformerSettings)
     outcome: OutcomeSettings = field(default_factory=OutcomeSettings)

@@ -26,7 +26,7 @@ from persist_cli.bench.scenes.interactions import Event
 from persist_cli.bench.scenes.scene_bench import SceneBench
 from persist_cli.bench.scenes.untold import Untold
 from persist_cli.bench.scenes.views import same_form
-from persist_cli.data.scene_samples import PICK_UP
+from persist_cli.data.scene_truth import PICK_UP
 from persist_cli.data.store import TrajectoryFile
 from persist_cli.evaluate.statistics import Draws, mean_figure
 from persist_cli.navigation.ground_mapper import body_of

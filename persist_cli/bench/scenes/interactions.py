@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from persist_cli.data.reference import parse_reference
-from persist_cli.data.scene_samples import DROP, PICK_UP, interactions_of
+from persist_cli.data.scene_truth import DROP, PICK_UP, interactions_of
 from persist_cli.data.store import TrajectoryFile
 from persist_cli.errors import DataError
 
