@@ -1,7 +1,7 @@
 """What the cells of a trajectory's scene truly hold: as its file stores them, or fused from all of its frames.
 
 A capture stores no cells. Its depth says which are free, and which are solid and in which colour; of all others it says
-nothing, and nothing is learned of them.
+nothing, and how much these count is for the model to say.
 """
 
 from __future__ import annotations
