@@ -55,11 +55,11 @@ def run_memorize(data: list[str], plan: MemorizePlan, picture: PictureOptions, o
     frames = sum(len(source.frames) for source in sources)
     paths: dict[str, Tensor] = {}
     for source in sources:
-        add_paths(paths, {source.file.name: source.file.poses()[source.frames.start : source.frames.stop]})
+        walked = source.file.poses()[source.frames.start : source.frames.stop]
+        add_paths(paths, {source.file.name: walked})
     extra = {"frames": frames, "frames_per_second": frames / seconds, "settings_of": origin}
     if scene is not None:
-        newest = sources[-1]
-        _check_floor(scene, config, newest.file.poses()[newest.frames[-1]])
+        _check_floor(scene, config, walked[-1])  # the newest camera
         began = time.perf_counter()
         with busy("imagining"):
             seed = config.settings.get("seed", 0) if plan.seed is None else plan.seed
