@@ -1,4 +1,4 @@
-"""Whether this processor multiplies in half precision, or would be many times slower than in float32."""
+"""Whether this processor multiplies in half precision, and whether it is faster or many times slower so."""
 
 from __future__ import annotations
 
@@ -19,3 +19,12 @@ def is_slow(dtype: torch.dtype) -> bool:
         return False
     check = getattr(torch.ops.mkldnn, f"_is_mkldnn_{NAMES[dtype]}_supported", None)
     return check is not None and not check()
+
+
+def has_bfloat16_tiles() -> bool:
+    """Whether this processor multiplies tiles of bfloat16 (AMX), which is several times as fast as float32.
+
+    Processors with instructions for vectors of it alone (AVX512-BF16) multiply matrices faster in float32.
+    """
+    check = getattr(torch.cpu, "_is_amx_tile_supported", None)
+    return torch.backends.mkldnn.is_available() and check is not None and bool(check())

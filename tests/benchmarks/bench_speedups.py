@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import torch
 import torch.nn.functional as F
@@ -24,6 +25,7 @@ from persist_backbones.cogvideox.inputs import camera_latents
 from persist_backbones.tensors import fold_frames
 from persist_cli.api.backbone import Backbone, Clip, Clips
 from persist_cli.api.geometry import plucker
+from persist_cli.api.half_precision import has_bfloat16_tiles
 from persist_cli.data.clips import ClipDataset, ClipPlan, ClipSample
 from persist_cli.io.hub import cached_weight
 from persist_cli.memorize.factory import MemoryFactory, with_memory
@@ -33,6 +35,7 @@ from persist_cli.plugins import make_backbone
 from persist_cli.policies.nomad.efficientnet import EfficientNet
 from persist_cli.policies.trained import packaged_policy
 from persist_cli.recipe import make_recipe, read_recipe
+from persist_cli.train.optimizer import MuonAndAdamW
 from persist_cli.train.tensor_cache import CacheSettings, TensorCache
 from tests.benchmarks.timing import alternate, say_conditions
 from tests.support.room_views import write_room_walks
@@ -117,6 +120,21 @@ def model_pairs(clips: Sequence[Clip]) -> list[Pair]:
     ]
 
 
+def optimizer_pairs() -> list[Pair]:
+    """Muon's steps of the reference model's matrices in bfloat16, where that is fast, and in float32."""
+    optimizers = [MuonAndAdamW(make_reference().trained_parameters("1").values(), 1e-3, 0.0) for _ in range(2)]
+    for optimizer in optimizers:
+        for group in optimizer.param_groups:
+            for parameter in group["params"]:
+                parameter.grad = torch.randn_like(parameter)
+
+    def without() -> None:
+        with patch("persist_cli.train.muon.has_bfloat16_tiles", return_value=False):
+            optimizers[0].step()
+
+    return [Pair("Muon in tiles of bfloat16: optimizer alone", without, optimizers[1].step)]
+
+
 def rays(clips: Clips) -> torch.Tensor:
     """The camera latents as the model computes them."""
     return camera_latents(clips.cameras, 4, 1, printed=False)
@@ -177,6 +195,7 @@ def main() -> None:
         pairs = [
             *codec_pairs(Clips.stack(clips)),
             *model_pairs(clips),
+            *(optimizer_pairs() if has_bfloat16_tiles() else ()),
             *policy_pairs(),
             *memory_pairs(longest, Path(folder) / "cache"),
             *(feature_pairs(longest) if cached_weight("dinov2-s-derived") else ()),

@@ -146,24 +146,22 @@ def render_views(tokens: MemoryTokens, cameras: Cameras, settings: RenderedSetti
     pictures, observed, covered = _surfaces(tokens, splats, shape, finer).split([4, 1, 1], dim=1)
     filled = push_pull(pictures, covered).unflatten(0, shape[:2])
     origins = torch.cat([observed, covered - observed], dim=1).unflatten(0, shape[:2])
-    return Views(filled[:, :, :3].movedim(2, -1).round().to(torch.uint8), filled[:, :, 3], origins, shown, drawn_pixels)
+    return Views(filled[:, :, 1:].movedim(2, -1).round().to(torch.uint8), filled[:, :, 0], origins, shown, drawn_pixels)
 
 
 def _surfaces(
     tokens: MemoryTokens, splats: Splats, shape: tuple[int, ...], finer: int
 ) -> Float[Tensor, "view 6 height width"]:
-    """Return colour, depth, whether it was observed, and 1 of the surface at each pixel; zeros where there is none.
+    """Return depth, colour, whether it was observed, and 1 of the surface at each pixel; zeros where there is none.
 
     Of its splats those that were seen from nearer count more: a pixel from half the distance shows a quarter of the
     area, and counts as the four that would cover what the other shows.
     """
     assert tokens.colors is not None
     columns = [tokens.colors.float(), (tokens.origins == Origin.OBSERVED)[..., None].float()]
-    color, observed = torch.cat(columns, dim=-1).flatten(0, 1).index_select(0, splats.token).split([3, 1], dim=1)
-    values = torch.cat([color, splats.depth[:, None].float(), observed], dim=1)
     distances = torch.ones_like(tokens.mask, dtype=torch.float32) if tokens.distances is None else tokens.distances
-    weights = distances.clamp_min(NEAR).square().reciprocal().flatten().index_select(0, splats.token)
-    return draw_means(values, weights, splats, shape, finer)
+    weights = distances.clamp_min(NEAR).square().reciprocal()
+    return draw_means(torch.cat(columns, dim=-1).flatten(0, 1), weights.flatten(), splats, shape, finer)
 
 
 def tokens_not_shown(tokens: MemoryTokens, shown: Bool[Tensor, "batch token"], cameras: Cameras, most: int) -> Tensor:

@@ -36,6 +36,22 @@ class Splats(NamedTuple):
     depth: Float[Tensor, " splat"]
 
 
+class Squares(NamedTuple):
+    """Squares of some tokens of some clips.
+
+    Args:
+        positions: world metres of their middles.
+        mask: false for padding.
+        sizes: edges in metres, float64.
+        token: flat index of batch and token.
+    """
+
+    positions: Float[Tensor, "clip square 3"]
+    mask: Bool[Tensor, "clip square"]
+    sizes: Float[Tensor, "clip square"]
+    token: Int[Tensor, "clip square"]
+
+
 def hide_covered(
     splats: Splats, shape: tuple[int, ...], thickness: float = 0.0, hole_share: float = 0.0
 ) -> tuple[Splats, Float[Tensor, "view height width"]]:
@@ -107,32 +123,32 @@ def splat(
 
 
 def draw_means(
-    values: Float[Tensor, "splat channel"],
-    weights: Float[Tensor, " splat"] | None,
+    values: Float[Tensor, "token channel"],
+    weights: Float[Tensor, " token"] | None,
     splats: Splats,
     shape: tuple[int, ...],
     finer: int,
-) -> Float[Tensor, "view channel+1 height width"]:
-    """Draw the weighted means of the values at each pixel, and coverage (0 or 1); zeros where there is no splat.
+) -> Float[Tensor, "view channel+2 height width"]:
+    """Draw the weighted means of depth and values at each pixel, and coverage (0 or 1); zeros where there is no splat.
 
     Args:
-        values: values of each splat.
+        values: values of each token of all batches.
         weights: weights above zero, of which only the ratios at a pixel count; all are alike without.
         splats: the pixels that tokens cover, without those that others hide.
         shape: axes of the views, such as batch and frames, then height and width that are drawn.
         finer: pixels that are drawn along the edge of a pixel, which is their mean.
     """
-    parts = torch.cat([values, torch.ones_like(values[:, :1])], dim=1)
+    columns = torch.cat([values[:, :1], values, torch.ones_like(values[:, :1])], dim=1)
+    parts = columns.index_select(0, splats.token)
+    parts[:, 0] = splats.depth
     if weights is not None:
+        weights = weights.index_select(0, splats.token)
         largest = weights.new_zeros(math.prod(shape)).scatter_reduce_(0, splats.pixel, weights, "amax")
         parts *= (weights / largest.index_select(0, splats.pixel))[:, None]  # no sum overflows or vanishes
-    total, weight = (
-        parts.new_zeros(math.prod(shape), parts.shape[1])
-        .index_add_(0, splats.pixel, parts)
-        .split([values.shape[1], 1], dim=1)
-    )
-    means = torch.cat([total / weight.clamp_min(1e-6), (weight > 0).to(total)], dim=1)
-    return F.avg_pool2d(means.unflatten(0, (-1, *shape[-2:])).movedim(-1, 1), finer)
+    total = parts.new_zeros(math.prod(shape), parts.shape[1]).index_add_(0, splats.pixel, parts).T.contiguous()
+    total[:-1] /= total[-1].clamp_min(1e-6)
+    total[-1] = total[-1] > 0
+    return F.avg_pool2d(total.unflatten(1, (-1, *shape[-2:])), finer).transpose(0, 1)
 
 
 def coarser(splats: Splats, size: tuple[int, int], coarse: tuple[int, int]) -> Splats:
@@ -166,41 +182,40 @@ def rasterize(
         most: limit of a square's size: it reaches at most ``most // 2`` pixels to each side of the one of its middle.
             So its edge is at most ``most`` pixels where that is odd, and one more where it is even.
     """
-    clips, frames = views.world_from_camera.shape[:2]
+    clips, tokens = mask.shape
     sizes = torch.as_tensor(token_size, dtype=torch.float64, device=mask.device).expand(mask.shape)
-    at_once = clips_at_once(views, positions.shape[1])
+    squares = Squares(positions, mask, sizes, torch.arange(mask.numel(), device=mask.device).view(mask.shape))
+    at_once = clips_at_once(views, tokens)
     parts = []
     for first in range(0, clips, at_once):
         part = slice(first, first + at_once)
         present = mask[part].any(dim=0).nonzero()[:, 0]  # what is padding in all of them is left out
-        chosen = positions[part, present], mask[part, present]
-        splats = _rasterize_clips(*chosen, views[part], sizes[part, present], most // 2)
-        clip, token = first + splats.token // len(present), present[splats.token % len(present)]
-        pixels = first * frames * views.height * views.width
-        parts.append(Splats(pixels + splats.pixel, clip * positions.shape[1] + token, splats.depth))
-    return Splats(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
+        chosen = Squares(*(column[part, present] for column in squares))
+        parts.append(_rasterize_clips(chosen, views[part], first, most // 2))
+    return parts[0] if len(parts) == 1 else Splats(*map(torch.cat, zip(*parts, strict=True)))
 
 
-def _rasterize_clips(
-    positions: Float[Tensor, "clip token 3"],
-    mask: Bool[Tensor, "clip token"],
-    views: Cameras,
-    sizes: Float[Tensor, "clip token"],
-    reach: int,
-) -> Splats:
-    """Return the splats in views of clips, with squares of at most ``reach`` pixels to each side of their middle."""
-    frames, count = views.world_from_camera.shape[1], positions.shape[1]
+def _rasterize_clips(squares: Squares, views: Cameras, first_clip: int, reach: int) -> Splats:
+    """Return the splats of squares that reach at most ``reach`` pixels to each side of their middle.
+
+    Args:
+        squares: squares of some clips.
+        views: the cameras of these clips.
+        first_clip: number of the first of them in the batch.
+        reach: pixels.
+    """
+    frames, count = views.world_from_camera.shape[1], squares.token.shape[1]
     flat = Cameras(views.world_from_camera.flatten(0, 1), views.intrinsics.flatten(0, 1), views.height, views.width)
-    middles, depth = project(positions[:, None].expand(-1, frames, -1, -1).flatten(0, 1), flat)
+    middles, depth = project(squares.positions[:, None].expand(-1, frames, -1, -1).flatten(0, 1), flat)
     axes = [places.contiguous() for places in middles.unbind(-1)]  # columns, rows: one after the other is faster
-    close = (depth > NEAR) & mask[:, None].expand(-1, frames, -1).flatten(0, 1)
+    close = (depth > NEAR) & squares.mask[:, None].expand(-1, frames, -1).flatten(0, 1)
     for places, length in zip(axes, (flat.width, flat.height), strict=True):
         close &= (places + SNAP >= -reach) & (places + SNAP < length + reach)
     chosen = close.flatten().nonzero()[:, 0]
     view = chosen // count
-    token = view // frames * count + chosen % count
+    place = view // frames * count + chosen % count
     depth = depth.flatten().index_select(0, chosen)
-    scale = 0.5 * sizes.flatten().index_select(0, token) / depth
+    scale = 0.5 * squares.sizes.flatten().index_select(0, place) / depth
     ranges = []
     for axis, (places, length) in enumerate(zip(axes, (flat.width, flat.height), strict=True)):
         middle = places.flatten().index_select(0, chosen)
@@ -210,8 +225,9 @@ def _rasterize_clips(
         last = (middle + half - 0.5 - SNAP).floor().maximum(center).minimum(center + reach).clamp_max(length - 1)
         ranges.append((first.long(), (last - first + 1).clamp_min(0).long()))
     (left, width), (top, height) = ranges
-    square, row = _counted(view * flat.height + top, height)
+    square, row = _counted((first_clip * frames + view) * flat.height + top, height)
     line, pixel = _counted(row * flat.width + left[square], width[square])
+    token = squares.token.flatten().index_select(0, place)
     return Splats(pixel, token[square].index_select(0, line), depth[square].index_select(0, line))
 
 

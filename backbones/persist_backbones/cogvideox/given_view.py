@@ -97,12 +97,10 @@ def render_given(
     sizes = SPREAD * depth.double() / first.intrinsics.double()[:, :1, 0, 0, None]
     splats = rasterize(unproject(depth[:, None], first).flatten(1, 3), present, views, sizes.flatten(1), MOST * FINER)
     visible, _ = hide_covered(splats, shape, THICKNESS)
-    colors = rgb.flatten(0, 2).float().index_select(0, visible.token)
-    values = torch.cat([colors, visible.depth[:, None].float()], dim=1)
-    pictures, covered = draw_means(values, None, visible, shape, FINER).split([4, 1], dim=1)
+    pictures, covered = draw_means(rgb.flatten(0, 2).float(), None, visible, shape, FINER).split([4, 1], dim=1)
     filled = push_pull(pictures, covered).unflatten(0, shape[:2])
     return GivenViews(
-        torch.cat([rgb[:, None], filled[:, :, :3].movedim(2, -1).round().to(torch.uint8)], dim=1),
-        torch.cat([depth[:, None], filled[:, :, 3].to(depth)], dim=1),
+        torch.cat([rgb[:, None], filled[:, :, 1:].movedim(2, -1).round().to(torch.uint8)], dim=1),
+        torch.cat([depth[:, None], filled[:, :, 0].to(depth)], dim=1),
         torch.cat([torch.ones_like(covered[:batch, None]), covered.unflatten(0, shape[:2])], dim=1),
     )
