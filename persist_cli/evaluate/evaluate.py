@@ -29,6 +29,7 @@ from persist_cli.evaluate.rows.model_rows import ModelRow
 from persist_cli.evaluate.statistics import LEAST_UNITS, RESAMPLES, SET_RESAMPLES
 from persist_cli.evaluate.windows import SHOWN, window_bounds
 from persist_cli.io.command_line import running_command
+from persist_cli.io.exclusive import exclusive
 from persist_cli.io.files import check_folder, write_json, write_text
 from persist_cli.output.console import print_json, say
 
@@ -58,25 +59,26 @@ def run_eval(paths: Sequence[Path], plan: EvalPlan, out: Path, report: Path | No
         if folder is not None:
             check_folder(folder)
     processes = Processes()
-    plan = replace(plan, data=tuple(data_folder(str(folder)) for folder in plan.data))
-    run, loader = prepare(paths or [reference_checkpoint()], plan, out, processes)
-    measure_rows(run, loader, processes)
-    if not processes.main:
-        return
-    results = results_json(run, processes.count)
-    results["scrutiny"] = scrutiny_json(check_results(results, "results"))
-    write_json(out / RESULTS, results)
-    write_text(out / TABLES, table_text(results))
-    if report is not None:
-        write_report(results, make_pictures(run, clips_by_domain(run), loader), report)
-    if json:
-        print_json(results)
-        return
-    print_results(results)
-    say(motion_line(results["measured"]["clips"]))
-    say(f"all columns, intervals and definitions: {out / TABLES}; every clip: {out / RESULTS}")
-    if report is not None:
-        say(f"with curves and videos: {report / PAGE}")
+    with exclusive(out, processes.main):
+        plan = replace(plan, data=tuple(data_folder(str(folder)) for folder in plan.data))
+        run, loader = prepare(paths or [reference_checkpoint()], plan, out, processes)
+        measure_rows(run, loader, processes)
+        if not processes.main:
+            return
+        results = results_json(run, processes.count)
+        results["scrutiny"] = scrutiny_json(check_results(results, "results"))
+        write_json(out / RESULTS, results)
+        write_text(out / TABLES, table_text(results))
+        if report is not None:
+            write_report(results, make_pictures(run, clips_by_domain(run), loader), report)
+        if json:
+            print_json(results)
+            return
+        print_results(results)
+        say(motion_line(results["measured"]["clips"]))
+        say(f"all columns, intervals and definitions: {out / TABLES}; every clip: {out / RESULTS}")
+        if report is not None:
+            say(f"with curves and videos: {report / PAGE}")
 
 
 def results_json(run: Evaluation, processes: int) -> dict[str, Any]:

@@ -31,6 +31,7 @@ from persist_cli.episodes.episodes import Episode, EpisodeSet, read_episodes
 from persist_cli.episodes.run_episode import LoopSettings
 from persist_cli.errors import DataError, PersistError
 from persist_cli.io.begun_with import check_same
+from persist_cli.io.exclusive import exclusive
 from persist_cli.io.files import check_folder, file_sha256, read_json, write_json, write_text
 from persist_cli.io.settings import parse_settings
 from persist_cli.learn.evaluation import STOP_COST, evaluate_policy, mean_figures, stop_rule
@@ -139,15 +140,17 @@ def run_learn(plan: LearnPlan, out: Path, as_json: bool) -> None:
     Raises:
         PersistError: one line for whatever does not fit.
     """
-    learning = prepare(plan, out)
-    # the lines of each training are no part of the JSON
-    with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
-        run_rounds(learning)
-    results = summary(learning)
-    write_json(out / RESULTS, results)
-    if learning.episodes:
-        draw_curves(success_curves(results), "actions of practice", "share of episodes", out / CURVE, False)
-    report(learning, results, as_json)
+    check_folder(out)
+    with exclusive(out):
+        learning = prepare(plan, out)
+        # the lines of each training are no part of the JSON
+        with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
+            run_rounds(learning)
+        results = summary(learning)
+        write_json(out / RESULTS, results)
+        if learning.episodes:
+            draw_curves(success_curves(results), "actions of practice", "share of episodes", out / CURVE, False)
+        report(learning, results, as_json)
 
 
 def run_rounds(learning: Learning) -> None:
@@ -166,7 +169,6 @@ def run_rounds(learning: Learning) -> None:
 
 def prepare(plan: LearnPlan, out: Path) -> Learning:
     """Check everything that can be checked before the model is loaded, and write nothing."""
-    check_folder(out)
     check_placement(plan.placement)  # a missing accelerator is an error before anything is loaded
     if plan.inside not in (MODEL, SIMULATOR):
         raise PersistError(f"--inside {plan.inside!r}: a policy practises inside the {MODEL} or the {SIMULATOR}")

@@ -48,6 +48,7 @@ from persist_cli.checkpoints.relink import weights_at
 from persist_cli.checkpoints.scene_models import TrainedSceneModel, check_stage, find_scene_model
 from persist_cli.errors import PersistError, RecipeError
 from persist_cli.io.command_line import quoted
+from persist_cli.io.exclusive import exclusive
 from persist_cli.io.files import check_folder
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.output.console import busy, say, warn
@@ -193,7 +194,7 @@ def finetune(recipe: Recipe, run: Path, stop: StopSignal, plan: FinetunePlan) ->
         The signal that ended the run before its last step, ``None`` when it reached that.
     """
     accelerator = make_accelerator(recipe, run)
-    with held_sources(recipe, run) as (recipe, base):
+    with exclusive(run, accelerator.is_main_process), held_sources(recipe, run) as (recipe, base):
         with busy("loading model and data"):
             trainer = prepare_trainer(recipe, run, base, accelerator, plan)
             folder = prepare_run(trainer, run, base, plan)

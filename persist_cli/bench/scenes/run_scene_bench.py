@@ -19,6 +19,7 @@ from persist_cli.bench.scenes.walk_part import run_walks, walk_json
 from persist_cli.evaluate.provenance import environment
 from persist_cli.evaluate.statistics import LEAST_UNITS, RESAMPLES
 from persist_cli.io.command_line import running_command
+from persist_cli.io.exclusive import exclusive
 from persist_cli.io.files import check_folder, write_json, write_text
 from persist_cli.output.console import print_json, say
 
@@ -44,21 +45,22 @@ def run_scene_bench(plan: SceneBenchPlan, out: Path, report: Path | None, json: 
     for folder in (out, report):
         if folder is not None:
             check_folder(folder)
-    bench = prepare(plan, out)
-    run_parts(bench)
-    results = results_json(bench)
-    write_json(out / RESULTS, results)
-    write_text(out / TABLES, tables_text(results))
-    if report is not None:
-        pictures = picture_views(bench) if "completion" in plan.parts else []
-        write_scene_report(results, pictures, report)
-    if json:
-        print_json(results)
-        return
-    print_results(results)
-    say(f"all columns, classes and differences: {out / TABLES}; every figure: {out / RESULTS}")
-    if report is not None:
-        say(f"with plans: {report / PAGE}")
+    with exclusive(out):
+        bench = prepare(plan, out)
+        run_parts(bench)
+        results = results_json(bench)
+        write_json(out / RESULTS, results)
+        write_text(out / TABLES, tables_text(results))
+        if report is not None:
+            pictures = picture_views(bench) if "completion" in plan.parts else []
+            write_scene_report(results, pictures, report)
+        if json:
+            print_json(results)
+            return
+        print_results(results)
+        say(f"all columns, classes and differences: {out / TABLES}; every figure: {out / RESULTS}")
+        if report is not None:
+            say(f"with plans: {report / PAGE}")
 
 
 def run_parts(bench: SceneBench) -> None:

@@ -1,0 +1,53 @@
+"""Folders that one command at a time writes into."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from persist_cli.errors import PersistError
+
+LOCK: Final = ".lock"  # its lock ends with the process that has it, also when that is killed
+
+
+@contextlib.contextmanager
+def exclusive(folder: Path, main: bool = True) -> Iterator[None]:
+    """Within the block no other command may write into a folder: two would delete what the other one has begun.
+
+    The folder is made where it is missing, and removed again when the block leaves nothing in it. Where the file system
+    has no locks, nobody is refused.
+
+    Args:
+        folder: the folder.
+        main: false in the other processes of a command, which the main one speaks for.
+
+    Raises:
+        PersistError: when another command has it.
+    """
+    if not main:
+        yield
+        return
+    from filelock import FileLock, Timeout
+
+    made = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / LOCK, timeout=0)
+    try:
+        lock.acquire()
+    except Timeout as error:
+        raise PersistError(
+            f"{folder}: another command is writing there; wait until it has ended, or choose another --out"
+        ) from error
+    except OSError:
+        pass  # the file system has no locks
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):  # Windows removes no file that is open
+            Path(lock.lock_file).unlink()
+        lock.release()
+        with contextlib.suppress(OSError):
+            for path in made:
+                path.rmdir()
