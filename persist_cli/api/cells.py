@@ -55,6 +55,11 @@ class CellForm:
     size: float = 0.25
     palette: tuple[str, ...] = COMMON
 
+    @property
+    def of_depth(self) -> bool:
+        """Whether there are no classes but those that depth tells, as in scenes of captures."""
+        return self.palette == COMMON
+
     def to_json(self) -> dict[str, Any]:
         """Return JSON values, which are also the settings of a scene with such cells."""
         return {"size": self.size, "palette": list(self.palette)}

@@ -105,8 +105,7 @@ class SceneSampleDataset(Dataset[SceneSamples]):
         cache: TensorStore | None = None,
     ) -> None:
         self.form, self.seed, self.shares = form, seed, shares or SampleShares()
-        fused = form.cells.palette == COMMON
-        self.files = [file for folder in folders for file in Store(folder) if file.has_cells or fused]
+        self.files = [file for folder in folders for file in Store(folder) if file.has_cells or form.cells.of_depth]
         if not self.files:
             where = " and ".join(map(str, folders))
             raise DataError(

@@ -20,7 +20,7 @@ from accelerate import Accelerator
 from accelerate.utils import GradientAccumulationPlugin, InitProcessGroupKwargs, set_seed
 
 from persist_cli.api.backbone import Backbone
-from persist_cli.api.cells import COMMON
+from persist_cli.api.cells import COMMON, CellForm
 from persist_cli.api.checkpoint import (
     PLAIN,
     Checkpoint,
@@ -388,7 +388,8 @@ def next_command(name: str, recipe: Recipe, run: Path) -> str:
         return f"persist bench scene {trained} --data HELD_OUT_DATA --parts evolution --out runs/bench-evolution"
     if recipe.stage == "scene":
         houses = quoted(recipe.data.path[0])
-        if recipe.scene is not None and list(recipe.scene.settings.get("palette", COMMON)) == list(COMMON):
+        settings = recipe.scene.settings if recipe.scene is not None else {}
+        if CellForm(palette=tuple(settings.get("palette", COMMON))).of_depth:
             return f"persist memorize {houses}#0:0 --memory scene --model {trained} --complete"
         return f"persist bench scene {trained} --data HELD_OUT_DATA --train {houses} --out runs/bench-scene"
     if recipe.distill is not None and recipe.stage == "1":
