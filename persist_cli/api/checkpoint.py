@@ -33,6 +33,7 @@ STEP: Final = "step-"  # start of the names of the folders of a run's checkpoint
 PLAIN: Final = "stage1"  # name of the base without any adapter
 REFERENCE: Final = "reference"  # names the model that comes with the package
 STARTED_FROM: Final = "started_from"  # the key of a card for the base of a run that holds all weights itself
+CODEC_ALONE: Final = "codec_alone"  # the key of a card for a codec that was exported without its video model
 SAMPLING_TYPES: Final = {  # a bool is no int here
     "steps": (int,),
     "sampler": (str,),

@@ -5,24 +5,31 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import re
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
 import torch
-import yaml
 
 from persist_cli import __version__
-from persist_cli.api.checkpoint import CARD, PLAIN, STEP, Checkpoint, find_checkpoint, lora_base
+from persist_cli.api.backbone import Backbone
+from persist_cli.api.checkpoint import CODEC_ALONE, PLAIN, Checkpoint, find_checkpoint, lora_base
 from persist_cli.api.inference import SamplingOverrides
 from persist_cli.api.scene import Scene
+from persist_cli.api.training_scenes import TrainingScenes
+from persist_cli.checkpoints.exported_files import (
+    convert,
+    copy_network,
+    copy_part,
+    is_copied,
+    print_files,
+    summed_files,
+    without_absolute_paths,
+)
 from persist_cli.checkpoints.lineage import (
     ADAPTERS,
     MEMORY_FILE,
-    RECIPE,
-    RECIPES,
     adapter_recipe,
     save_stage_recipes,
     stage_recipes,
@@ -36,23 +43,14 @@ from persist_cli.io.files import (
     check_folder,
     empty_folder_aside,
     folder_aside,
-    read_json,
-    read_tensors,
     write_json,
-    write_tensors,
-    write_text,
 )
-from persist_cli.io.sha256sums import SUMS, read_sums, write_sums
-from persist_cli.output.console import busy, print_json, print_table, say, watched
-from persist_cli.plugins import load_plugin
+from persist_cli.io.sha256sums import write_sums
+from persist_cli.output.console import busy, watched
+from persist_cli.plugins import load_plugin, make_backbone
 from persist_cli.policies.trained import find_policy, is_policy, write_policy_card
-from persist_cli.recipe import parse_yaml_mapping
 
 PRECISIONS: Final = {"float16": torch.float16, "bfloat16": torch.bfloat16, "float32": torch.float32}
-
-MADE_ANEW: Final = {CARD, RECIPE, SUMS}  # files at the top of a checkpoint's folder that an export does not copy
-
-LOADED_FROM: Final = "_name_or_path"  # the key under which diffusers notes where it once loaded a part from
 
 NAMED_RUN: Final = re.compile(r"(?P<name>[A-Za-z0-9][A-Za-z0-9_-]*)=(?P<run>.+)")
 
@@ -67,6 +65,14 @@ class ExportPlan:
     default: str | None
     sampling: SamplingOverrides
     protocol_sampling: Mapping[str, SamplingOverrides] = field(default_factory=dict)
+    codec: bool = False
+
+    def check_options(self, network: str) -> None:
+        """Raise ``PersistError`` when adapters or a sampling are named for a network that has none."""
+        if self.runs or self.default or self.sampling.requested() or self.protocol_sampling:
+            raise PersistError(
+                f"{self.checkpoint}: {network} has no adapters and no sampling; give --dtype and --out alone"
+            )
 
 
 @dataclass(frozen=True)
@@ -98,6 +104,9 @@ def run_export(plan: ExportPlan, out: Path, json: bool) -> None:
     if out.exists():
         raise PersistError(f"{out}: exists already; choose another --out")
     check_folder(out)
+    if plan.codec:
+        export_codec(plan, out, json)
+        return
     if is_policy(plan.checkpoint):
         export_policy(plan, out, json)
         return
@@ -118,14 +127,54 @@ def run_export(plan: ExportPlan, out: Path, json: bool) -> None:
     for adapter in adapters.values():
         scenes |= training_scenes(adapter.checkpoint)
     with folder_aside(out) as folder:
-        _write_checkpoint(folder, base, adapters, PRECISIONS[plan.dtype])
-        with busy("hashing the files"):
-            hashes = hash_weights(folder)
-            card = {"backbone": base.backbone, "settings": base.settings, "fingerprint": fingerprint(hashes)}
-            write_card(folder, card | defaults | {"exported_by": __version__}, scenes)
-            hashes = write_sums(folder, hashes)
-        files = {name: {"bytes": (folder / name).stat().st_size, "sha256": hashes[name]} for name in sorted(hashes)}
-    _print_files(out, {"fingerprint": card["fingerprint"]} | defaults, files, json)
+        with _merged_base(base, folder) as home:
+            _write_checkpoint(folder, home, adapters, PRECISIONS[plan.dtype])
+        save_stage_recipes(folder, _recipes(base, adapters))
+        written = _write_card(folder, base, defaults, scenes)
+    print_files(out, {"fingerprint": written} | defaults, summed_files(out), json)
+
+
+def export_codec(plan: ExportPlan, out: Path, json: bool) -> None:
+    """Write the codec of a world model, as a base for other video models, and print a table of its files.
+
+    Raises:
+        PersistError: when there is none, or options of adapters and sampling are given.
+    """
+    plan.check_options("a codec")
+    base = find_checkpoint(plan.checkpoint)
+    if base.settings.get("pretrained") or lora_base(base.base_folder) is not None:
+        raise PersistError(
+            f"{plan.checkpoint}: its codec is that of pretrained weights; a recipe names those as "
+            "backbone.settings.pretrained"
+        )
+    if load_plugin("backbone", base.backbone).load_codec is Backbone.load_codec:
+        raise PersistError(f"{plan.checkpoint}: backbone {base.backbone!r} has no codec that stands alone")
+    base.check_weights(None)
+    defaults = {"dtype": plan.dtype, CODEC_ALONE: True}
+    with folder_aside(out) as folder:
+        with empty_folder_aside(folder) as home:
+            with busy("loading the codec"), torch.random.fork_rng(devices=[]):
+                torch.manual_seed(0)
+                backbone = make_backbone(base.backbone, base.settings)
+                backbone.load_codec(base.base_folder)
+                backbone.save_base(home)
+            _write_checkpoint(folder, home, {}, PRECISIONS[plan.dtype])
+        save_stage_recipes(
+            folder, {name: text for name, text in _recipes(base, {}).items() if name.startswith("codec")}
+        )
+        written = _write_card(folder, base, defaults, training_scenes(base))
+    print_files(out, {"fingerprint": written} | defaults, summed_files(out), json)
+
+
+def _write_card(folder: Path, base: Checkpoint, defaults: Mapping[str, Any], scenes: TrainingScenes) -> str:
+    """Write card and ``SHA256SUMS`` of an export, and return its fingerprint."""
+    with busy("hashing the files"):
+        hashes = hash_weights(folder)
+        written = fingerprint(hashes)
+        card = {"backbone": base.backbone, "settings": base.settings, "fingerprint": written}
+        write_card(folder, {**card, **defaults, "exported_by": __version__}, scenes)
+        write_sums(folder, hashes)
+    return written
 
 
 def export_policy(plan: ExportPlan, out: Path, json: bool) -> None:
@@ -137,7 +186,7 @@ def export_policy(plan: ExportPlan, out: Path, json: bool) -> None:
     policy = find_policy(plan.checkpoint)
     with _network_folder(plan, policy.folder, "a policy", out) as folder:
         write_policy_card(folder, policy.plugin, policy.settings, policy.training_scenes)
-    _print_files(out, {"policy": policy.plugin, "dtype": plan.dtype}, _summed_files(out), json)
+    print_files(out, {"policy": policy.plugin, "dtype": plan.dtype}, summed_files(out), json)
 
 
 def export_scene_model(plan: ExportPlan, out: Path, json: bool) -> None:
@@ -149,35 +198,17 @@ def export_scene_model(plan: ExportPlan, out: Path, json: bool) -> None:
     model = find_scene_model(plan.checkpoint)
     with _network_folder(plan, model.folder, "a model of scenes", out) as folder:
         write_scene_card(folder, model.plugin, model.settings, model.stage, model.training_scenes)
-    _print_files(out, {"scene": model.plugin, "dtype": plan.dtype}, _summed_files(out), json)
+    print_files(out, {"scene": model.plugin, "dtype": plan.dtype}, summed_files(out), json)
 
 
 @contextlib.contextmanager
 def _network_folder(plan: ExportPlan, source: Path, network: str, out: Path) -> Iterator[Path]:
     """The folder of an exported network, with its weights and recipe; the block writes its card."""
-    if plan.runs or plan.default or plan.sampling.requested() or plan.protocol_sampling:
-        raise PersistError(
-            f"{plan.checkpoint}: {network} has no adapters and no sampling; give --dtype and --out alone"
-        )
+    plan.check_options(network)
     with folder_aside(out) as folder:
-        _copy_network(source, folder, PRECISIONS[plan.dtype])
+        copy_network(source, folder, PRECISIONS[plan.dtype])
         yield folder
         write_sums(folder)
-
-
-def _copy_network(source: Path, folder: Path, dtype: torch.dtype) -> None:
-    """Write the weights and the recipe of a network into a folder."""
-    for weights in sorted(source.glob("*.safetensors")):
-        _convert(weights, folder / weights.name, dtype)
-    recipe = source / RECIPE
-    if recipe.is_file():
-        write_text(folder / RECIPE, _without_absolute_paths(recipe.read_text(encoding="utf-8"), str(recipe)))
-
-
-def _summed_files(folder: Path) -> dict[str, dict[str, Any]]:
-    """Bytes and hash of each file of an exported network."""
-    hashes = read_sums(folder) or {}
-    return {name: {"bytes": (folder / name).stat().st_size, "sha256": hashes[name]} for name in sorted(hashes)}
 
 
 def _find_adapters(base: Checkpoint, runs: Sequence[str]) -> dict[str, AdapterSource]:
@@ -276,23 +307,28 @@ def _protocol_sampling(base: Checkpoint, plan: ExportPlan) -> dict[str, dict[str
     return {protocol: asdict(sampling) for protocol, sampling in samplings.items()}
 
 
-def _write_checkpoint(folder: Path, base: Checkpoint, adapters: dict[str, AdapterSource], dtype: torch.dtype) -> None:
-    """Write base, adapters and recipes into the folder."""
-    with _merged_base(base, folder) as home:
-        paths = [path.relative_to(home) for path in base_files(home, "*")]
-        jobs = [(home / path, folder / path) for path in paths if _is_copied(path)]
-        for name, adapter in adapters.items():
-            files = sorted(path for path in adapter.folder.glob("[!.]*") if path.is_file())
-            jobs += [(path, folder / ADAPTERS / name / path.name) for path in files]
-        for source, target in watched(jobs, "export", "files"):
-            target.parent.mkdir(parents=True, exist_ok=True)
-            try:
-                _convert(source, target, dtype) if source.suffix == ".safetensors" else _copy(source, target)
-            except OSError as error:  # a run that still trains clears its old checkpoints away; a disk fills up
-                raise CheckpointError(f"{source}: cannot be exported ({error.strerror or error})") from error
+def _write_checkpoint(folder: Path, home: Path, adapters: dict[str, AdapterSource], dtype: torch.dtype) -> None:
+    """Write a base's own files and adapters into the folder.
+
+    Args:
+        folder: the folder.
+        home: where the base's own files are.
+        adapters: by the names that they get.
+        dtype: precision of the weights.
+    """
+    paths = [path.relative_to(home) for path in base_files(home, "*")]
+    jobs = [(home / path, folder / path) for path in paths if is_copied(path)]
+    for name, adapter in adapters.items():
+        files = sorted(path for path in adapter.folder.glob("[!.]*") if path.is_file())
+        jobs += [(path, folder / ADAPTERS / name / path.name) for path in files]
+    for source, target in watched(jobs, "export", "files"):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            convert(source, target, dtype) if source.suffix == ".safetensors" else copy_part(source, target)
+        except OSError as error:  # a run that still trains clears its old checkpoints away; a disk fills up
+            raise CheckpointError(f"{source}: cannot be exported ({error.strerror or error})") from error
     for name, adapter in adapters.items():
         _put_scene_model_beside(adapter, folder / ADAPTERS / name, dtype)
-    save_stage_recipes(folder, _recipes(base, adapters))
 
 
 def _put_scene_model_beside(adapter: AdapterSource, folder: Path, dtype: torch.dtype) -> None:
@@ -307,7 +343,7 @@ def _put_scene_model_beside(adapter: AdapterSource, folder: Path, dtype: torch.d
         return
     model, beside = find_scene_model(place), folder / BESIDE
     beside.mkdir()
-    _copy_network(model.folder, beside, dtype)
+    copy_network(model.folder, beside, dtype)
     write_scene_card(beside, model.plugin, model.settings, model.stage, model.training_scenes)
     write_sums(beside)
     write_json(folder / MEMORY_FILE, asdict(replace(memory, settings=memory.settings | {"model": BESIDE})))
@@ -325,41 +361,6 @@ def _merged_base(base: Checkpoint, beside: Path) -> Iterator[Path]:
         yield folder
 
 
-def _is_copied(path: Path) -> bool:
-    """Whether a file of a base, by its path in the folder, is the backbone's and not one that an export makes anew."""
-    hidden = any(part.startswith(".") for part in path.parts)
-    return str(path) not in MADE_ANEW and path.parts[0] != RECIPES and not hidden
-
-
-def _copy(source: Path, target: Path) -> None:
-    """Copy a file; a configuration of diffusers without the folder that it was loaded from."""
-    values = read_json(source) if source.suffix == ".json" else None
-    if not isinstance(values, dict) or LOADED_FROM not in values:
-        shutil.copyfile(source, target)
-        return
-    write_json(target, {key: value for key, value in values.items() if key != LOADED_FROM})
-
-
-def _convert(source: Path, target: Path, dtype: torch.dtype) -> None:
-    """Write a weight file in another precision; integers stay integers.
-
-    Raises:
-        CheckpointError: when a value is too large for the precision, naming the tensor.
-    """
-    tensors, metadata = read_tensors(source)
-    for name, tensor in tensors.items():
-        if not tensor.is_floating_point():
-            continue
-        tensors[name] = tensor.to(dtype)
-        if not torch.equal(tensors[name].isfinite(), tensor.isfinite()):
-            most, limit = float(tensor.abs().max()), torch.finfo(dtype).max
-            raise CheckpointError(
-                f"{source}: {name!r} holds {most:.4g}, more than {str(dtype).removeprefix('torch.')} can "
-                f"({limit:.4g}); export with --dtype bfloat16 or float32"
-            )
-    write_tensors(target, tensors, metadata)
-
-
 def _recipes(base: Checkpoint, adapters: dict[str, AdapterSource]) -> dict[str, str]:
     """Texts of the recipes behind an export by file name: those of the base's stages and ``adapters/NAME.yaml``.
 
@@ -369,35 +370,4 @@ def _recipes(base: Checkpoint, adapters: dict[str, AdapterSource]) -> dict[str, 
     for name, adapter in adapters.items():
         text = adapter_recipe(adapter.checkpoint, adapter.adapter)
         recipes |= {f"{ADAPTERS}/{name}.yaml": text} if text is not None else {}
-    return {name: _without_absolute_paths(text, name) for name, text in recipes.items()}
-
-
-def _without_absolute_paths(text: str, where: str) -> str:
-    values = parse_yaml_mapping(text, where)
-    data: dict[str, Any] = values.get("data") or {}
-    settings: dict[str, Any] = (values.get("backbone") or {}).get("settings") or {}
-    memory: dict[str, Any] = (values.get("memory") or {}).get("settings") or {}
-    places = [(values, "base"), (values, "adapter_from"), (values.get("distill") or {}, "teacher"), (data, "path")]
-    for owner, key in (*places, (settings, "pretrained"), (settings, "prompt_embedding"), (memory, "model")):
-        if key in owner:
-            owner[key] = _last_part(owner[key])
-    return yaml.safe_dump(values, sort_keys=False)
-
-
-def _last_part(value: Any) -> Any:
-    if isinstance(value, list):
-        return [_last_part(path) for path in value]
-    if not isinstance(value, str) or not Path(value).is_absolute():
-        return value
-    path = Path(value)
-    return path.parent.name if path.name.startswith(STEP) else path.name  # that of its run
-
-
-def _print_files(out: Path, card: dict[str, Any], files: dict[str, dict[str, Any]], json: bool) -> None:
-    total = sum(file["bytes"] for file in files.values())
-    if json:
-        print_json({"folder": str(out), **card, "bytes": total, "files": files})
-        return
-    rows = [(name, f"{file['bytes']:,}") for name, file in files.items()]
-    print_table(str(out), ("file", "bytes"), [*rows, ("all", f"{total:,}")])
-    say(f"{total / 1e6:.1f} MB, weights in {card['dtype']}; check them with: cd {out} && sha256sum -c {SUMS}")
+    return {name: without_absolute_paths(text, name) for name, text in recipes.items()}

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from persist_cli.api.checkpoint import PLAIN, Checkpoint, find_checkpoint
+from persist_cli.api.checkpoint import CODEC_ALONE, PLAIN, Checkpoint, find_checkpoint, read_card
 from persist_cli.api.inference import CONSISTENCY
 from persist_cli.api.scene import Scene
 from persist_cli.checkpoints.lineage import MEMORY_FILE, RECIPE
@@ -149,23 +149,31 @@ def named_adapter(text: str) -> tuple[Checkpoint, str]:
     return checkpoint, chosen
 
 
-def start_backbone(config: BackboneConfig, base: Checkpoint | None) -> Backbone:
+def start_backbone(config: BackboneConfig, base: Checkpoint | None, fresh: bool = False) -> Backbone:
     """The backbone that a training begins with: a fresh one, or that of the base with the config's settings on top.
 
-    Of a base that is a codec trained from nothing, the config may change the video model: that is then a fresh one.
+    Of a base that is a codec alone, the config may change the video model: that is then a fresh one.
+
+    Args:
+        config: the backbone of the recipe.
+        base: the checkpoint that the training starts from.
+        fresh: of a base that is a codec alone, the video model is a fresh one of this training's seed in any case.
 
     Raises:
         RecipeError: when the base is of another backbone than the config, or was built by other settings.
     """
+    from persist_cli.api.backbone import Backbone
     from persist_cli.plugins import load_plugin, make_backbone
 
     if base is None:
         return make_backbone(config.name, config.settings)
     if base.backbone != config.name:
         raise RecipeError(f"base {base.folder} is of backbone {base.backbone!r}, not {config.name!r}")
-    built_by = load_plugin("backbone", config.name).built_by
-    changed = changed_settings(base.settings, {key: config.settings[key] for key in built_by if key in config.settings})
-    if not changed:
+    plugin = load_plugin("backbone", config.name)
+    built_by = [key for key in plugin.built_by if key in config.settings]
+    changed = changed_settings(base.settings, {key: config.settings[key] for key in built_by})
+    fresh = fresh and plugin.load_codec is not Backbone.load_codec and is_own_codec(base)
+    if not changed and not fresh:
         return load_backbone(base, config.settings)
     if not is_own_codec(base):
         raise RecipeError(
@@ -199,11 +207,13 @@ def changed_settings(settings: Mapping[str, Any], changes: Mapping[str, Any]) ->
 
 
 def is_own_codec(base: Checkpoint) -> bool:
-    """Whether a base is a codec that was trained from nothing, so that its video model has random weights.
+    """Whether a base is a codec alone, trained from nothing or exported so: its video model has random weights.
 
     Raises:
         RecipeError: when its recipe is damaged.
     """
+    if read_card(base.base_folder).get(CODEC_ALONE):
+        return True
     recipe = base.base_folder / RECIPE
     if not recipe.is_file():
         return False

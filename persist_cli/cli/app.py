@@ -242,6 +242,7 @@ def export(
     sampling_for: Annotated[
         list[str] | None, typer.Option(help="Of a protocol of eval, as in return:steps=20,sampler=ddim,guidance=1.")
     ] = None,
+    codec: Annotated[bool, typer.Option("--codec", help="The codec alone, as a base for other video models.")] = False,
     verify: VerifyOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -255,7 +256,7 @@ def export(
     protocols = SamplingOverrides.by_protocol(sampling_for or [])
     plan = ExportPlan(
         checkpoint=checkpoint, runs=runs or [], dtype=dtype, default=default, sampling=sampling,
-        protocol_sampling=protocols,
+        protocol_sampling=protocols, codec=codec,
     )  # fmt: skip
     run_export(plan, out, json)
 
