@@ -50,14 +50,13 @@ def test_a_video_model_of_another_size_is_trained_on_it(persist, walks, exported
     assert model.encoding() == load_backbone(find_checkpoint(exported)).encoding()
 
 
-@pytest.mark.parametrize("base", ["exported", "codec"])
 def test_the_seed_of_a_training_decides_on_the_weights_that_its_video_model_begins_with(
-    persist, walks, base, tmp_path, request
+    persist, walks, codec, exported, tmp_path
 ):
-    codec = request.getfixturevalue(base)
+    """On a codec's run, whose own video model has these sizes, and on an exported codec."""
     begun = [
-        trained(persist, walks, tmp_path / name, f"base={codec}", f"training.seed={seed}").transformer.state_dict()
-        for name, seed in (("one", 1), ("again", 1), ("two", 2))
+        trained(persist, walks, tmp_path / name, f"base={base}", f"training.seed={seed}").transformer.state_dict()
+        for name, base, seed in (("one", codec, 1), ("exported", exported, 1), ("two", codec, 2))
     ]
     assert all(torch.equal(begun[0][name], begun[1][name]) for name in begun[0])
     weight = "base.transformer_blocks.0.attn1.to_q.weight"
