@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from persist_cli.errors import PersistError
+from persist_cli.io.files import made_folder
 
 LOCK: Final = ".lock"  # its lock ends with the process that has it, also when that is killed
 
@@ -31,23 +32,19 @@ def exclusive(folder: Path, main: bool = True) -> Iterator[None]:
         return
     from filelock import FileLock, Timeout
 
-    made = [path for path in (folder, *folder.parents) if not path.exists()]
-    folder.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(folder / LOCK, timeout=0)
-    try:
-        lock.acquire()
-    except Timeout as error:
-        raise PersistError(
-            f"{folder}: another command is writing there; wait until it has ended, or choose another --out"
-        ) from error
-    except OSError:
-        pass  # the file system has no locks
-    try:
-        yield
-    finally:
-        with contextlib.suppress(OSError):  # Windows removes no file that is open
-            Path(lock.lock_file).unlink()
-        lock.release()
-        with contextlib.suppress(OSError):
-            for path in made:
-                path.rmdir()
+    with made_folder(folder):
+        lock = FileLock(folder / LOCK, timeout=0)
+        try:
+            lock.acquire()
+        except Timeout as error:
+            raise PersistError(
+                f"{folder}: another command is writing there; wait until it has ended, or choose another --out"
+            ) from error
+        except OSError:
+            pass  # the file system has no locks
+        try:
+            yield
+        finally:
+            with contextlib.suppress(OSError):  # Windows removes no file that is open
+                Path(lock.lock_file).unlink()
+            lock.release()

@@ -49,25 +49,34 @@ SAFETENSORS_TYPES: Final = {  # the format's names for those of torch
 
 
 @contextlib.contextmanager
+def made_folder(folder: Path) -> Iterator[None]:
+    """Within the block a folder is there; what had to be made is removed again when the block leaves nothing in it."""
+    made = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            for path in made:
+                path.rmdir()
+
+
+@contextlib.contextmanager
 def written_aside(path: Path) -> Iterator[Path]:
     """A temporary path in the same folder that becomes ``path`` when the block ends well.
 
     When it does not, folders that were made for it are removed again, unless something else is in them by then.
     """
-    made = [folder for folder in path.parents if not folder.exists()]
-    path.parent.mkdir(parents=True, exist_ok=True)
     aside = _path_aside(path)
-    try:
-        yield aside
-        with aside.open("r+b") as file:  # Windows syncs no file that is open for reading alone
-            os.fsync(file.fileno())
-        aside.replace(path)
-    except BaseException:
-        aside.unlink(missing_ok=True)
-        with contextlib.suppress(OSError):
-            for folder in made:
-                folder.rmdir()
-        raise
+    with made_folder(path.parent):
+        try:
+            yield aside
+            with aside.open("r+b") as file:  # Windows syncs no file that is open for reading alone
+                os.fsync(file.fileno())
+            aside.replace(path)
+        except BaseException:
+            aside.unlink(missing_ok=True)
+            raise
 
 
 def write_text(path: Path, text: str) -> None:
