@@ -13,7 +13,6 @@ from typing import Any, Final
 import torch
 
 from persist_cli import __version__
-from persist_cli.api.backbone import Backbone
 from persist_cli.api.checkpoint import CODEC_ALONE, PLAIN, Checkpoint, find_checkpoint, lora_base
 from persist_cli.api.inference import SamplingOverrides
 from persist_cli.api.scene import Scene
@@ -35,7 +34,14 @@ from persist_cli.checkpoints.lineage import (
     stage_recipes,
     training_scenes,
 )
-from persist_cli.checkpoints.load import adapter_memory, empty_backbone, load_backbone, warn_of_plain
+from persist_cli.checkpoints.load import (
+    adapter_memory,
+    empty_backbone,
+    fresh_on_codec,
+    load_backbone,
+    takes_codec_alone,
+    warn_of_plain,
+)
 from persist_cli.checkpoints.save import base_files, fingerprint, hash_weights, write_card
 from persist_cli.checkpoints.scene_models import BESIDE, PACKAGED, find_scene_model, is_scene_model, write_scene_card
 from persist_cli.errors import CheckpointError, PersistError, hint
@@ -47,7 +53,7 @@ from persist_cli.io.files import (
 )
 from persist_cli.io.sha256sums import write_sums
 from persist_cli.output.console import busy, watched
-from persist_cli.plugins import load_plugin, make_backbone
+from persist_cli.plugins import load_plugin
 from persist_cli.policies.trained import find_policy, is_policy, write_policy_card
 
 PRECISIONS: Final = {"float16": torch.float16, "bfloat16": torch.bfloat16, "float32": torch.float32}
@@ -147,17 +153,14 @@ def export_codec(plan: ExportPlan, out: Path, json: bool) -> None:
             f"{plan.checkpoint}: its codec is that of pretrained weights; a recipe names those as "
             "backbone.settings.pretrained"
         )
-    if load_plugin("backbone", base.backbone).load_codec is Backbone.load_codec:
+    if not takes_codec_alone(base):
         raise PersistError(f"{plan.checkpoint}: backbone {base.backbone!r} has no codec that stands alone")
-    base.check_weights(None)
     defaults = {"dtype": plan.dtype, CODEC_ALONE: True}
     with folder_aside(out) as folder:
         with empty_folder_aside(folder) as home:
             with busy("loading the codec"), torch.random.fork_rng(devices=[]):
                 torch.manual_seed(0)
-                backbone = make_backbone(base.backbone, base.settings)
-                backbone.load_codec(base.base_folder)
-                backbone.save_base(home)
+                fresh_on_codec(base, {}).save_base(home)
             _write_checkpoint(folder, home, {}, PRECISIONS[plan.dtype])
         save_stage_recipes(
             folder, {name: text for name, text in _recipes(base, {}).items() if name.startswith("codec")}

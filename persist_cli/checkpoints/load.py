@@ -162,26 +162,39 @@ def start_backbone(config: BackboneConfig, base: Checkpoint | None, fresh: bool 
     Raises:
         RecipeError: when the base is of another backbone than the config, or was built by other settings.
     """
-    from persist_cli.api.backbone import Backbone
     from persist_cli.plugins import load_plugin, make_backbone
 
     if base is None:
         return make_backbone(config.name, config.settings)
     if base.backbone != config.name:
         raise RecipeError(f"base {base.folder} is of backbone {base.backbone!r}, not {config.name!r}")
-    plugin = load_plugin("backbone", config.name)
-    built_by = [key for key in plugin.built_by if key in config.settings]
-    changed = changed_settings(base.settings, {key: config.settings[key] for key in built_by})
-    fresh = fresh and plugin.load_codec is not Backbone.load_codec and is_own_codec(base)
-    if not changed and not fresh:
+    if fresh and takes_codec_alone(base) and is_own_codec(base):
+        return fresh_on_codec(base, config.settings)
+    built_by = load_plugin("backbone", config.name).built_by
+    changed = changed_settings(base.settings, {key: config.settings[key] for key in built_by if key in config.settings})
+    if not changed:
         return load_backbone(base, config.settings)
     if not is_own_codec(base):
         raise RecipeError(
             f"backbone.settings.{changed[0]}: base {base.folder} is a model that was built with another; leave it out"
         )
-    base.check_weights(None)
-    backbone = make_backbone(config.name, merge_settings(base.settings, config.settings))
-    backbone.load_codec(base.base_folder)
+    return fresh_on_codec(base, config.settings)
+
+
+def takes_codec_alone(checkpoint: Checkpoint) -> bool:
+    """Whether the backbone of a checkpoint can take the codec of one alone."""
+    from persist_cli.api.backbone import Backbone
+
+    return load_plugin("backbone", checkpoint.backbone).load_codec is not Backbone.load_codec
+
+
+def fresh_on_codec(checkpoint: Checkpoint, settings: Mapping[str, Any]) -> Backbone:
+    """A backbone with fresh weights on the codec of a checkpoint; the settings replace those of the checkpoint."""
+    from persist_cli.plugins import make_backbone
+
+    checkpoint.check_weights(None)
+    backbone = make_backbone(checkpoint.backbone, merge_settings(checkpoint.settings, settings))
+    backbone.load_codec(checkpoint.base_folder)
     return backbone
 
 
