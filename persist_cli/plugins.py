@@ -47,7 +47,7 @@ KINDS: Final = {
     "memory": PluginKind("persist.memories", "persist_cli.api.memory:Memory", ("settings", "encoder", "reference")),
     "encoder": PluginKind("persist.encoders", "persist_cli.api.encoder:Encoder", ("settings",)),
     "simulator": PluginKind("persist.simulators", "persist_cli.api.simulator:Simulator", ("settings",)),
-    "importer": PluginKind("persist.importers", "persist_cli.api.importer:Importer", ()),
+    "importer": PluginKind("persist.importers", "persist_cli.api.importer:Importer", ("settings",)),
     "policy": PluginKind("persist.policies", "persist_cli.api.policy:Policy", ("settings",)),
     "cost": PluginKind("persist.costs", "persist_cli.api.cost:Cost", ("settings",)),
     "scene model": PluginKind("persist.scene_models", "persist_cli.api.scene_model:SceneModel", ("settings",)),
@@ -330,9 +330,9 @@ def check_simulator(name: str) -> None:
         raise PluginError(f"simulator {name!r} {needs}")
 
 
-def make_importer(name: str) -> Importer:
-    """Make the importer of a name."""
-    return load_plugin("importer", name)()  # type: ignore[no-any-return]
+def make_importer(name: str, settings: dict[str, Any]) -> Importer:
+    """Make the importer of a name with plain settings."""
+    return _make("importer", name, settings)  # type: ignore[no-any-return]
 
 
 def make_policy(name: str, settings: dict[str, Any]) -> Policy:

@@ -6,9 +6,11 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, ClassVar
 
 from persist_cli.api.observations import Frame, TrajectoryInfo
 from persist_cli.errors import DataError
+from persist_cli.io.settings import NoSettings
 
 
 @dataclass(frozen=True)
@@ -31,9 +33,17 @@ class ForeignTrajectory:
 
 
 class Importer(ABC):
-    """Reads one foreign format and converts it to OpenCV axes, metres and planar z."""
+    """Reads one foreign format and converts it to OpenCV axes, metres and planar z.
 
+    Args:
+        settings: an instance of ``settings_type``; ``None`` for its defaults.
+    """
+
+    settings_type: ClassVar[type] = NoSettings
     name: str = ""  # set by the registry
+
+    def __init__(self, settings: Any = None) -> None:
+        self.settings = self.settings_type() if settings is None else settings
 
     @abstractmethod
     def trajectories(self, source: Path) -> Iterator[ForeignTrajectory]:

@@ -23,6 +23,7 @@ from persist_cli.cli.options import (
     DtypeOption,
     GuidanceOption,
     HoldOutOption,
+    ImporterSettingsOption,
     JsonOption,
     ReferenceArgument,
     SamplerOption,
@@ -148,6 +149,7 @@ def import_(
     skip_bad: SkipBadOption = False,
     hold_out: HoldOutOption = 0.0,
     up: Annotated[str | None, typer.Option(help="Where up is in the poses' world: 0,0,1; else estimated.")] = None,
+    settings: ImporterSettingsOption = None,
     json: JsonOption = False,
 ) -> None:
     """Import posed RGB-D of another format.
@@ -159,12 +161,13 @@ def import_(
     from persist_cli.data.images import parse_size
     from persist_cli.data.importers.gravity import parse_up
     from persist_cli.data.importers.importing import ImportPlan, run_import
+    from persist_cli.recipe import apply_overrides
 
     plan = ImportPlan(
         size=parse_size(size) if size else None, every=every, step=step, turn=turn, skip_bad=skip_bad,
         hold_out=hold_out, up=parse_up(up) if up else None,
     )  # fmt: skip
-    run_import(format, source, out, plan, json)
+    run_import(format, source, out, plan, json, apply_overrides({}, settings or ()))
 
 
 @app.command()

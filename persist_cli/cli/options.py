@@ -53,6 +53,10 @@ SimulatorSettingsOption = Annotated[
     list[str] | None, typer.Option("--set", help="Of the simulator, where no option has it: radius=0.15.")
 ]
 
+ImporterSettingsOption = Annotated[
+    list[str] | None, typer.Option("--set", help="Of the importer, as in pose=observation.pose.")
+]
+
 CemSettingsOption = Annotated[
     list[str] | None, typer.Option("--set", help="Of cem, as in method.elites=0.1 or method.kept=0.3.")
 ]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import bisect
-import contextlib
 import itertools
 import json
 import sys
@@ -23,6 +22,7 @@ from persist_cli.api.cameras import Cameras, check_poses
 from persist_cli.api.cells import CellForm, CellGrid
 from persist_cli.api.observations import Frame, Observations, Trajectory, TrajectoryInfo
 from persist_cli.data.images import decode_depth, decode_rgb, encode_depth, encode_rgb
+from persist_cli.data.parquet import parquet_errors
 from persist_cli.data.storable import check_frame, check_info
 from persist_cli.data.store_header import CELLS, COLUMNS, METADATA_KEY, read_info, schema
 from persist_cli.data.stored_cells import CellBox, encode_cells
@@ -136,7 +136,7 @@ class TrajectoryFile:
             raise self.without_cells()
         (number,) = self.frame_numbers([frame])
         groups = range(bisect.bisect_right(self._group_starts, number))
-        with _parquet_errors(self.path), self._open() as file:
+        with parquet_errors(self.path), self._open() as file:
             parts = file.read_row_groups([*groups], columns=[CELLS.name], use_threads=False)[CELLS.name].to_pylist()
         try:
             return box.read(parts[: number + 1], self.info.world_up)
@@ -206,7 +206,7 @@ class TrajectoryFile:
 
     @cached_property
     def _metadata(self) -> Any:
-        with _parquet_errors(self.path):
+        with parquet_errors(self.path):
             metadata = pq.read_metadata(self.path.absolute())  # what begins with a name and a colon might be an address
         missing = set(COLUMNS.names) - set(metadata.schema.to_arrow_schema().names)
         if METADATA_KEY in (metadata.metadata or {}) and missing:
@@ -251,7 +251,7 @@ class TrajectoryFile:
         starts = self._group_starts
         group_of = {number: bisect.bisect_right(starts, number) - 1 for number in numbers}
         groups = sorted(set(group_of.values()))
-        with _parquet_errors(self.path), self._open() as file:
+        with parquet_errors(self.path), self._open() as file:
             table = file.read_row_groups(groups, columns=[*columns], use_threads=False)
         first_row: dict[int, int] = {}  # of each row group in the table
         for group in groups:
@@ -261,7 +261,7 @@ class TrajectoryFile:
 
     def _column(self, name: str) -> list[Any]:
         self.info  # noqa: B018  a foreign file is reported as one, not as one with a missing column
-        with _parquet_errors(self.path), self._open() as file:
+        with parquet_errors(self.path), self._open() as file:
             return list(file.read(columns=[name], use_threads=False)[name].to_pylist())
 
     def _open(self) -> Any:
@@ -338,18 +338,6 @@ def _trajectory_paths(folder: Path) -> list[Path]:
 def _stacked(images: list[np.ndarray[Any, Any]]) -> Tensor:
     """One tensor of all images, in memory that torch allocated."""
     return torch.stack([torch.from_numpy(image) for image in images])
-
-
-@contextlib.contextmanager
-def _parquet_errors(path: Path) -> Iterator[None]:
-    """Turn whatever a missing or damaged file raises into one line."""
-    try:
-        yield
-    except FileNotFoundError as error:
-        raise DataError(f"{path}: no such file") from error
-    except (pa.ArrowException, OSError) as error:
-        cause = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise DataError(f"{path}: not a whole Parquet file ({cause})") from error
 
 
 def _row(frame: Frame) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -173,7 +173,9 @@ class ImportPlan:
         return crop_resize((info.height, info.width), self.size or (info.height, info.width))
 
 
-def run_import(format: str, source: Path, out: Path, plan: ImportPlan, json: bool) -> None:
+def run_import(
+    format: str, source: Path, out: Path, plan: ImportPlan, json: bool, settings: Mapping[str, Any] | None = None
+) -> None:
     """Import every trajectory of ``source`` that is not yet in ``out``, and print what there is.
 
     Args:
@@ -182,12 +184,13 @@ def run_import(format: str, source: Path, out: Path, plan: ImportPlan, json: boo
         out: data set folder.
         plan: changes to every trajectory.
         json: print JSON instead of a table.
+        settings: plain settings of the importer.
 
     Raises:
         PersistError: for an unknown format or a broken importer, a source that cannot be read, or a trajectory of other
             settings in ``out``.
     """
-    importer = make_importer(format)
+    importer = make_importer(format, dict(settings or {}))
     check_folder(out)
     if not source.exists():
         raise DataError(f"{source}: no such file or folder")

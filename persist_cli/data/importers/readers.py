@@ -67,6 +67,22 @@ def decode_color(data: bytes, name: str) -> np.ndarray[Any, Any]:
     return _eight_bits(_read_image(io.BytesIO(data), name), name)
 
 
+def decode_channel(data: bytes, name: str) -> np.ndarray[Any, Any]:
+    """The numbers ``[height, width]`` of the bytes of a one-channel image, integers or float32, as they are stored.
+
+    Args:
+        data: the bytes.
+        name: what messages call it.
+
+    Raises:
+        DataError: when it is no whole image, or has several channels.
+    """
+    raw = np.array(_read_image(io.BytesIO(data), name))
+    if raw.ndim != 2:
+        raise DataError(f"{name}: must have one channel, has {raw.shape[2]}")
+    return raw
+
+
 def read_levels(path: Path) -> np.ndarray[Any, Any]:
     """The ``[height, width]`` integers of a one-channel image, as of confidence.
 

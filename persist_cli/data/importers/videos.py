@@ -1,15 +1,17 @@
-"""The frames of a video file as stored images."""
+"""The pictures of video files, as stored images."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from persist_cli.data.importers.lenses import Array, Size
 from persist_cli.data.importers.readers import StoredImage
 from persist_cli.errors import DataError
+
+LONGEST_SKIP: Final = 1.0  # seconds that are decoded to come to a later picture; beyond, a key picture is sought
 
 
 class VideoFrames:
@@ -21,7 +23,7 @@ class VideoFrames:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._next, self._pictures = 0, self._decoded()
+        self._next, self._pictures = 0, decoded(path)
 
     def frame(self, number: int) -> StoredImage:
         """One of the frames, counted from 0."""
@@ -33,7 +35,7 @@ class VideoFrames:
         Raises:
             DataError: when the file is missing or no video.
         """
-        self._next, self._pictures = 1, self._decoded()
+        self._next, self._pictures = 1, decoded(self.path)
         picture = next(self._pictures, None)
         if picture is None:
             raise DataError(f"{self.path}: holds no frames of a video")
@@ -42,24 +44,65 @@ class VideoFrames:
     def _read(self, number: int) -> Array:
         """Colours ``[height, width, 3]`` of a frame; ``DataError`` when the video ends before it, or is damaged."""
         if number < self._next:
-            self._next, self._pictures = 0, self._decoded()
+            self._next, self._pictures = 0, decoded(self.path)
         for picture in self._pictures:
             self._next += 1
             if self._next > number:
                 return picture.to_ndarray(format="rgb24")  # type: ignore[no-any-return]
-        ended, self._next, self._pictures = self._next, 0, self._decoded()
+        ended, self._next, self._pictures = self._next, 0, decoded(self.path)
         raise DataError(f"{self.path}: the video ends after {ended} frames, there is no frame {number}")
 
-    def _decoded(self) -> Iterator[Any]:
-        """Every picture in turn."""
-        import av
 
-        try:
-            with av.open(str(self.path.absolute())) as container:
-                for stream in container.streams.video[:1]:
-                    stream.thread_type = "AUTO"
-                    yield from container.decode(stream)
-        except FileNotFoundError as error:
-            raise DataError(f"{self.path}: no such file") from error
-        except (OSError, av.error.FFmpegError) as error:
-            raise DataError(f"{self.path}: cannot be read as a video ({error})") from error
+class TimedPictures:
+    """Pictures of videos by their times, best read in their order. Of all these files only one is open."""
+
+    def __init__(self) -> None:
+        self._path: Path | None = None
+        self._time = 0.0
+        self._pictures: Iterator[Any] = iter(())
+
+    def at(self, path: Path, seconds: float, tolerance: float) -> Any:
+        """The picture of a time.
+
+        Args:
+            path: the video.
+            seconds: since its beginning.
+            tolerance: by how many seconds the picture's time may differ.
+
+        Returns:
+            PyAV's frame.
+
+        Raises:
+            DataError: when the file is missing or no video, or no picture is of that time.
+        """
+        if path != self._path or not self._time < seconds - tolerance <= self._time + LONGEST_SKIP:
+            self._path, self._pictures = path, decoded(path, seconds - LONGEST_SKIP)
+        for picture in self._pictures:
+            self._time = picture.time
+            if self._time > seconds + tolerance:
+                break
+            if self._time >= seconds - tolerance:
+                return picture
+        self._path = None
+        raise DataError(f"{path}: no picture of {seconds:.3f} s in it")
+
+
+def decoded(path: Path, since: float = 0.0) -> Iterator[Any]:
+    """Every picture of a video in turn, from the last key picture before a time, in seconds, on.
+
+    Raises:
+        DataError: when the file is missing or damaged.
+    """
+    import av
+
+    try:
+        with av.open(str(path.absolute())) as container:
+            for stream in container.streams.video[:1]:
+                stream.thread_type = "AUTO"
+                if since > 0:
+                    container.seek(int(since / stream.time_base), stream=stream)
+                yield from container.decode(stream)
+    except FileNotFoundError as error:
+        raise DataError(f"{path}: no such file") from error
+    except (OSError, av.error.FFmpegError) as error:
+        raise DataError(f"{path}: cannot be read as a video ({error})") from error

@@ -1,0 +1,200 @@
+"""LeRobot datasets, version 3: ``meta/info.json``, ``meta/episodes``, ``data`` in Parquet, ``videos`` in MP4.
+
+One file holds many episodes; where each begins is said in ``meta/episodes``. Nothing says what the numbers mean: by the
+settings the user names the feature that is the pose, and says of what. The matrix of the camera stands beside the
+folders, in ``camera-intrinsics.txt``. Depth is a video of 12 bits or a column of images, as LeRobot writes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path, PurePosixPath
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from persist_cli.api.importer import ForeignTrajectory, Importer
+from persist_cli.data.importers.captures import Capture, CapturedFrame, folders_with, world_up_of
+from persist_cli.data.importers.lerobot_images import Images, VideoImages, choose_images, image_features
+from persist_cli.data.importers.lerobot_info import ROBOT, LeRobotSettings, PoseFeature, read_info
+from persist_cli.data.importers.readers import INTRINSICS, StoredImage, read_lens
+from persist_cli.data.parquet import parquet_errors
+from persist_cli.errors import DataError
+
+META: Final = "meta"
+INFO: Final = "info.json"
+EPISODES: Final = "episodes"  # in the same folder
+CHUNK_AND_FILE: Final = ("chunk_index", "file_index")
+UP_OF_ROBOTS: Final = (0.0, 0.0, 1.0), "z, as of a robot"
+
+
+class LeRobot(Importer):
+    """The importer of one dataset, or of a folder of datasets."""
+
+    settings_type = LeRobotSettings
+    settings: LeRobotSettings
+
+    def trajectories(self, source: Path) -> Iterator[ForeignTrajectory]:
+        """Read every episode of every dataset of ``source``.
+
+        Raises:
+            DataError: when there is none, the settings name what it does not have, or a file is missing or damaged.
+        """
+        for folder in folders_with(META, source, f"{META}/{INFO} in it nor folders with one"):
+            captures = Dataset(folder, self.settings).captures()
+            if self.settings.axes == ROBOT:
+                yield from (capture.trajectory(UP_OF_ROBOTS) for capture in captures)
+            elif self.settings.scene == "episode":
+                yield from (capture.trajectory(world_up_of([capture])) for capture in captures)
+            else:
+                episodes = list(captures)
+                up = world_up_of(episodes)
+                yield from (episode.trajectory(up) for episode in episodes)
+
+
+@dataclass(frozen=True)
+class Episode:
+    """Where an episode is stored.
+
+    Args:
+        number: of the episode.
+        length: number of its frames.
+        data: the file of its numbers, and of images that are in a column.
+        videos: by the feature, its video, and the second at which the episode begins there.
+    """
+
+    number: int
+    length: int
+    data: Path
+    videos: Mapping[str, tuple[Path, float]]
+
+
+class Dataset:
+    """A dataset on disk.
+
+    Args:
+        folder: the folder of its ``meta``.
+        settings: what its features mean.
+
+    Raises:
+        DataError: when it is of another version, or has not what the settings name.
+    """
+
+    def __init__(self, folder: Path, settings: LeRobotSettings) -> None:
+        self.folder, self.settings = folder, settings
+        self.path = folder / META / INFO
+        self.info = read_info(self.path)
+        where, features = str(self.path), self.info["features"]
+        self.pose = PoseFeature.of(features, settings, where)
+        images, rate = image_features(features, where), float(self.info["fps"])
+        self.color = choose_images(images, settings.color, False, rate, where)
+        self.depth = choose_images(images, settings.depth, True, rate, where)
+        self.lens = replace(read_lens(folder / INTRINSICS, 3), size=self.color.feature.size)
+        self._table: tuple[Path, pa.Table] | None = None  # of the file that was read last
+
+    def captures(self) -> Iterator[Capture]:
+        """Yield every episode.
+
+        Raises:
+            DataError: when a file of it is missing or damaged, or none of its poses can be used.
+        """
+        for episode in self._episodes():
+            yield self._capture(episode)
+
+    def _capture(self, episode: Episode) -> Capture:
+        table, rows = self._rows(episode)
+        where = f"{episode.data}: episode {episode.number}"
+        try:
+            times = [float(time) for time in table["timestamp"].to_pylist()]
+        except (TypeError, ValueError) as error:
+            raise DataError(f"{where}: its timestamps are no times ({error})") from error
+        poses = self.pose.poses(table[self.pose.key].to_pylist(), where)
+        color, depth = (self._stored(images, episode, rows, times) for images in (self.color, self.depth))
+        depth_lens = None if self.depth.feature.size == self.color.feature.size else self.lens
+        frames = [
+            CapturedFrame(rgb, distance, pose, self.lens, depth_lens, time)
+            for rgb, distance, pose, time in zip(color, depth, poses, times, strict=True)
+        ]
+        name, part = self.folder.name, f"episode-{episode.number:06}"
+        alone = self.settings.scene == "episode"
+        videos = [video for video, _ in episode.videos.values()]
+        return Capture(
+            folder=self.folder,
+            scene=f"{name}-{part}" if alone else name,
+            frames=frames,
+            files=[self.path, self.folder / INTRINSICS, episode.data, *videos],
+            source={"format": "lerobot", "episode": episode.number, "settings": asdict(self.settings)},
+            part="" if alone else part,
+        )
+
+    @staticmethod
+    def _stored(images: Images, episode: Episode, rows: Sequence[int], times: Sequence[float]) -> list[StoredImage]:
+        """The images of an episode, by its rows in the file of its numbers or by its times."""
+        if not isinstance(images, VideoImages):
+            return [images.image(episode.data, row) for row in rows]
+        video, start = episode.videos[images.feature.key]
+        return [images.image(video, start + time) for time in times]
+
+    def _episodes(self) -> Iterator[Episode]:
+        """Where each episode is stored."""
+        videos = [images.feature.key for images in (self.color, self.depth) if isinstance(images, VideoImages)]
+        columns = ["episode_index", "length", *(f"data/{name}" for name in CHUNK_AND_FILE)]
+        columns += [f"videos/{key}/{name}" for key in videos for name in (*CHUNK_AND_FILE, "from_timestamp")]
+        folder = self.path.parent / EPISODES
+        paths = sorted(folder.glob("*/*.parquet"))
+        if not paths:
+            raise DataError(f"{folder}: no episodes in it; the recording was perhaps not finalized")
+        for path in paths:
+            for row in _read_columns(path, columns).to_pylist():
+                try:
+                    yield self._episode(row, videos)
+                except (TypeError, ValueError, OverflowError) as error:
+                    raise DataError(f"{path}: an episode is damaged ({error})") from error
+
+    def _episode(self, row: Mapping[str, Any], videos: Sequence[str]) -> Episode:
+        return Episode(
+            number=int(row["episode_index"]),
+            length=int(row["length"]),
+            data=self._file("data_path", row, "data"),
+            videos={
+                key: (self._file("video_path", row, f"videos/{key}", key), float(row[f"videos/{key}/from_timestamp"]))
+                for key in videos
+            },
+        )
+
+    def _file(self, template: str, row: Mapping[str, Any], columns: str, key: str = "") -> Path:
+        """A file by its template in the description; ``DataError`` when that leads nowhere in the dataset."""
+        numbers = {name: int(row[f"{columns}/{name}"]) for name in CHUNK_AND_FILE}
+        try:
+            path = PurePosixPath(self.info[template].format(video_key=key, **numbers))
+        except (AttributeError, KeyError, IndexError, ValueError) as error:
+            raise DataError(f"{self.path}: {template} is no name of a file ({error!r})") from error
+        if path.is_absolute() or ".." in path.parts:
+            raise DataError(f"{self.path}: {template} leads out of the dataset, to {path}")
+        return self.folder / path
+
+    def _rows(self, episode: Episode) -> tuple[pa.Table, list[int]]:
+        """The rows of an episode, and their numbers in the file."""
+        path = episode.data
+        if self._table is None or self._table[0] != path:
+            self._table = path, _read_columns(path, ["episode_index", "timestamp", self.pose.key])
+        table = self._table[1]
+        rows = np.flatnonzero(table["episode_index"].to_numpy() == episode.number)
+        if not len(rows) or len(rows) != episode.length:
+            raise DataError(
+                f"{path}: {len(rows)} rows of episode {episode.number}, which has {episode.length} frames by "
+                f"{META}/{EPISODES}"
+            )
+        return table.take(rows), [int(row) for row in rows]
+
+
+def _read_columns(path: Path, columns: Sequence[str]) -> pa.Table:
+    """The columns of a file; ``DataError`` when it is damaged or lacks one."""
+    with parquet_errors(path), pq.ParquetFile(path) as file:
+        table = file.read(columns=list(dict.fromkeys(columns)))
+    if missing := [name for name in columns if name not in table.column_names]:
+        raise DataError(f"{path}: no column {missing[0]!r}")
+    return table
