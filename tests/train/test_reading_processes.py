@@ -52,6 +52,9 @@ def test_a_signal_to_all_processes_ends_none_that_still_begins():
 def test_a_signal_that_is_held_back_comes_nevertheless():
     with StopSignal.awaited() as stop:
         with held_back_signals():
-            os.kill(os.getpid(), signal.SIGINT)  # another thread, which does not hold it back, may take it at once
+            os.kill(os.getpid(), signal.SIGINT)  # another thread, which does not hold it back, may take it, at any time
+        latest = time.monotonic() + 10
+        while stop.signal is None and time.monotonic() < latest:
+            time.sleep(0.01)
         assert stop.signal == signal.SIGINT
     assert not {*STOPPING} & signal.pthread_sigmask(signal.SIG_BLOCK, ())
