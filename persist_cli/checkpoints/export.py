@@ -38,6 +38,7 @@ from persist_cli.checkpoints.load import (
     adapter_memory,
     empty_backbone,
     fresh_on_codec,
+    is_own_codec,
     load_backbone,
     takes_codec_alone,
     warn_of_plain,
@@ -110,16 +111,16 @@ def run_export(plan: ExportPlan, out: Path, json: bool) -> None:
     if out.exists():
         raise PersistError(f"{out}: exists already; choose another --out")
     check_folder(out)
-    if plan.codec:
-        export_codec(plan, out, json)
-        return
-    if is_policy(plan.checkpoint):
+    if not plan.codec and is_policy(plan.checkpoint):
         export_policy(plan, out, json)
         return
-    if is_scene_model(plan.checkpoint):
+    if not plan.codec and is_scene_model(plan.checkpoint):
         export_scene_model(plan, out, json)
         return
     base = find_checkpoint(plan.checkpoint)
+    if plan.codec or (takes_codec_alone(base) and is_own_codec(base)):
+        export_codec(plan, base, out, json)
+        return
     adapters = _find_adapters(base, plan.runs)
     base = _sampled_as(adapters, base, plan.sampling)
     defaults = {
@@ -140,14 +141,13 @@ def run_export(plan: ExportPlan, out: Path, json: bool) -> None:
     print_files(out, {"fingerprint": written} | defaults, summed_files(out), json)
 
 
-def export_codec(plan: ExportPlan, out: Path, json: bool) -> None:
+def export_codec(plan: ExportPlan, base: Checkpoint, out: Path, json: bool) -> None:
     """Write the codec of a world model, as a base for other video models, and print a table of its files.
 
     Raises:
         PersistError: when there is none, or options of adapters and sampling are given.
     """
     plan.check_options("a codec")
-    base = find_checkpoint(plan.checkpoint)
     if base.settings.get("pretrained") or lora_base(base.base_folder) is not None:
         raise PersistError(
             f"{plan.checkpoint}: its codec is that of pretrained weights; a recipe names those as "

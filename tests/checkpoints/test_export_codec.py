@@ -43,6 +43,16 @@ def test_it_has_the_codec_and_the_scenes_of_the_model_but_no_trained_video_model
     assert not torch.equal(ours["base.proj_out.weight"], theirs["base.proj_out.weight"])
 
 
+def test_what_is_a_codec_alone_stays_one_in_every_export(persist, codec, exported, tmp_path):
+    """A codec's run and an exported codec, whether the option is given or not."""
+    for name, model, option in (("run", codec, ()), ("again", exported, ()), ("told", exported, ("--codec",))):
+        assert persist("export", model, *option, "--dtype", "float32", "--out", tmp_path / name).code == 0
+        assert json.loads((tmp_path / name / CARD).read_text())["codec_alone"] is True
+        assert [path.name for path in (tmp_path / name / "recipes").iterdir()] == ["codec.yaml"]
+        encoding = load_backbone(find_checkpoint(tmp_path / name)).encoding()
+        assert encoding == load_backbone(find_checkpoint(model)).encoding()
+
+
 def test_a_video_model_of_another_size_is_trained_on_it(persist, walks, exported, tmp_path):
     larger = "backbone.settings.transformer.num_layers=3"
     model = trained(persist, walks, tmp_path / "run", f"base={exported}", larger)
