@@ -15,6 +15,7 @@ import torch
 from persist_backbones.cogvideox.inputs import _fitted_positions
 from persist_cli.api.backbone import Backbone
 from persist_cli.api.clips import ClipLatents
+from persist_cli.doctor import doctor as doctor_module
 from persist_cli.doctor.changes import CHECKPOINTING, EIGHT_BIT, FROZEN, LORA, OFFLOAD, Strategy, strategies
 from persist_cli.doctor.doctor import Doctor, _verdict, launch_command
 from persist_cli.doctor.machine import GIB, Machine, machine_of
@@ -207,6 +208,13 @@ def test_the_launch_command_runs_the_recipe_with_the_strategy():
     assert line.startswith("accelerate launch --num_machines 8 --machine_rank R --main_process_ip HOST ")
 
 
+@pytest.fixture
+def no_changes(monkeypatch):
+    """Recipes are estimated as they are alone: no change is considered, each of which would run a step."""
+    monkeypatch.setattr(doctor_module, "available_changes", lambda *_: [])
+
+
+@pytest.mark.usefixtures("no_changes")
 def test_stage_1_is_compared_with_the_stage_2_that_stands_on_it(persist):
     settings = [*MICRO, *SAVING, "base=nowhere", "--gpus", "1", "--gpu-memory", "1", "--json"]
     recipes = ("tiny-stage1", "tiny-stage2-voxel")
@@ -216,21 +224,11 @@ def test_stage_1_is_compared_with_the_stage_2_that_stands_on_it(persist):
     assert not any(strategy["name"] == "stage 2 only" for strategy in stage2)
 
 
+@pytest.mark.usefixtures("no_changes")
 def test_stage_2_is_compared_on_the_model_of_this_stage_1_whatever_else_this_is_given(persist):
     def stage2(*settings):
-        words = (
-            "tiny-stage1",
-            *MICRO,
-            *SAVING,
-            "base=nowhere",
-            *settings,
-            "--gpus",
-            "1",
-            "--gpu-memory",
-            "8",
-            "--json",
-        )
-        ended = persist("doctor", *words)
+        words = (*MICRO, *SAVING, "base=nowhere", *settings, "--gpus", "1", "--gpu-memory", "8", "--json")
+        ended = persist("doctor", "tiny-stage1", *words)
         assert ended.code == 0, ended.err
         return json.loads(ended.out)["strategies"][-1]
 
@@ -242,6 +240,7 @@ def test_stage_2_is_compared_on_the_model_of_this_stage_1_whatever_else_this_is_
     assert wider["need"]["weights"] > plain["need"]["weights"]
 
 
+@pytest.mark.usefixtures("no_changes")
 def test_a_stage_2_that_cannot_stand_on_this_stage_1_is_said(persist):
     ended = persist("doctor", "capture-64-stage1", "backbone.settings.transformer.num_layers=2", "--gpu-memory", "8",
                     "--gpus", "1")  # fmt: skip
