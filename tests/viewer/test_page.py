@@ -84,7 +84,7 @@ def test_of_the_changes_that_wait_the_last_one_is_drawn(server, room):
         waiting = [threading.Thread(target=draw, args=(number,)) for number in range(5)]
         for thread in waiting:
             thread.start()
-        time.sleep(0.1)
+        time.sleep(0.5)  # until all wait
     for thread in waiting:
         thread.join()
     assert len(drawn) == 1
