@@ -33,6 +33,9 @@ learning: $(STAMP)
 scenes: $(STAMP)
 	$(VENV)/bin/python -m persist_cli.reproduce.scenes runs/scenes
 
+# hundreds of processes of the tests import the same modules, whose bytecode is kept for that, whatever the shell says
+test test-slow: export PYTHONDONTWRITEBYTECODE :=
+
 # two processes of one thread each take about half the time of one, and each file stays in one process, the longest first
 test: $(STAMP) lint
 	$(VENV)/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --durations=20 -m "not slow and not gpu"
