@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import shutil
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -138,6 +139,18 @@ def write_episodes(folder: Path, lengths: Sequence[int]) -> None:
     pq.write_table(pa.Table.from_pylist(rows), path)
 
 
+def write_later_episode(folder: Path) -> None:
+    """Add the first episode again as LeRobot does with a recording that goes on: in files of its own."""
+    for place in ("data", "meta/episodes", f"videos/{COLOR}", f"videos/{DEPTH}"):
+        [first] = (folder / place / "chunk-000").iterdir()
+        second = Path(shutil.copy(first, first.with_stem("file-001")))
+        if second.suffix == ".parquet":
+            rows = pq.read_table(second).to_pydict()
+            rows["episode_index"] = [1] * len(rows["episode_index"])
+            rows |= {name: [1] for name in rows if name.endswith("/file_index")}
+            pq.write_table(pa.table(rows), second)
+
+
 def codes(depth: np.ndarray, near: float = 0.01) -> np.ndarray:
     """Depth in metres as LeRobot writes it into a video: 12 bits, by a logarithm; one pixel missing, one too far."""
     depth = depth.copy()
@@ -160,10 +173,11 @@ def picture(image: np.ndarray, form: str) -> dict[str, Any]:
     return {"bytes": buffer.getvalue(), "path": None}
 
 
-def write_codes(path: Path, images: Sequence[np.ndarray], bits: int = 12) -> None:
+def write_codes(path: Path, images: Sequence[np.ndarray], bits: int = 12, title: str = "") -> None:
     """Write integers ``[height, width]`` as a video that keeps every value."""
     height, width = images[0].shape
     with av.open(str(path), "w") as container:
+        container.metadata["title"] = title
         options = {"x265-params": "lossless=1:log-level=none", "g": "2"}
         stream = container.add_stream("hevc", rate=Fraction(RATE), options=options)
         stream.height, stream.width, stream.pix_fmt = height, width, f"gray{bits}le"

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import itertools
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -11,6 +12,9 @@ from persist_cli.data.importers.lenses import Array, Size
 from persist_cli.data.importers.readers import StoredImage
 from persist_cli.errors import DataError
 
+FORMATS: Final = "mov,matroska,avi"  # of FFmpeg; playlists and the like are none, as they name other files
+MOST_PIXELS: Final = 2**26
+SURE: Final = 1 / 8  # of the tolerance: a picture whose time is so near is the one that is meant
 LONGEST_SKIP: Final = 1.0  # seconds that are decoded to come to a later picture; beyond, a key picture is sought
 
 
@@ -58,11 +62,12 @@ class TimedPictures:
 
     def __init__(self) -> None:
         self._path: Path | None = None
-        self._time = 0.0
+        self._seconds = 0.0
+        self._held: Sequence[Any] = ()  # the picture of this file and time, and one that was decoded after it
         self._pictures: Iterator[Any] = iter(())
 
     def at(self, path: Path, seconds: float, tolerance: float) -> Any:
-        """The picture of a time.
+        """The picture that is nearest to a time.
 
         Args:
             path: the video.
@@ -75,29 +80,43 @@ class TimedPictures:
         Raises:
             DataError: when the file is missing or no video, or no picture is of that time.
         """
-        if path != self._path or not self._time < seconds - tolerance <= self._time + LONGEST_SKIP:
-            self._path, self._pictures = path, decoded(path, seconds - LONGEST_SKIP)
-        for picture in self._pictures:
-            self._time = picture.time
-            if self._time > seconds + tolerance:
-                break
-            if self._time >= seconds - tolerance:
-                return picture
+        if path != self._path or not self._seconds <= seconds <= self._seconds + LONGEST_SKIP:
+            self._held, self._pictures = (), decoded(path, seconds - LONGEST_SKIP)
+        found, held = None, iter(self._held)
+        later = list[Any]()
         self._path = None
-        raise DataError(f"{path}: no picture of {seconds:.3f} s in it")
+        for picture in itertools.chain(held, self._pictures):
+            if picture.time is None or picture.time < seconds - tolerance:
+                continue
+            if found is not None and picture.time - seconds >= abs(found.time - seconds):
+                later.append(picture)
+                break
+            if picture.time > seconds + tolerance:
+                break
+            found = picture
+            if picture.time >= seconds - SURE * tolerance:
+                break
+        if found is None:
+            raise DataError(f"{path}: no picture of {seconds:.3f} s in it")
+        self._path, self._seconds, self._held = path, seconds, (found, *later, *held)
+        return found
 
 
 def decoded(path: Path, since: float = 0.0) -> Iterator[Any]:
     """Every picture of a video in turn, from the last key picture before a time, in seconds, on.
 
     Raises:
-        DataError: when the file is missing or damaged.
+        DataError: when the file is missing or damaged, or its pictures are larger than any camera's.
     """
     import av
 
+    if path.exists() and not path.is_file():  # one that never ends would be waited for
+        raise DataError(f"{path}: not a file")
     try:
-        with av.open(str(path.absolute())) as container:
+        options = {"format_whitelist": FORMATS}
+        with av.open(str(path.absolute()), options=options, metadata_errors="replace") as container:
             for stream in container.streams.video[:1]:
+                stream.codec_context.options = {"max_pixels": str(MOST_PIXELS)}
                 stream.thread_type = "AUTO"
                 if since > 0:
                     container.seek(int(since / stream.time_base), stream=stream)
