@@ -7,6 +7,9 @@ folders, in ``camera-intrinsics.txt``. Depth is a video of 12 bits or a column o
 
 from __future__ import annotations
 
+import hashlib
+import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -21,13 +24,16 @@ from persist_cli.data.importers.captures import Capture, CapturedFrame, folders_
 from persist_cli.data.importers.lerobot_images import Images, VideoImages, choose_images, image_features
 from persist_cli.data.importers.lerobot_info import ROBOT, LeRobotSettings, PoseFeature, read_info
 from persist_cli.data.importers.readers import INTRINSICS, StoredImage, read_lens
-from persist_cli.data.parquet import parquet_errors
+from persist_cli.data.parquet import column, parquet_errors
 from persist_cli.errors import DataError
 
 META: Final = "meta"
 INFO: Final = "info.json"
 EPISODES: Final = "episodes"  # in the same folder
 CHUNK_AND_FILE: Final = ("chunk_index", "file_index")
+FIELD: Final = re.compile(r"\{(video_key|(chunk|file)_index(:0?\d?d)?)\}")  # of a template for the names of files
+LONGEST_PATH: Final = 1000  # letters
+LATEST: Final = 1e9  # seconds
 UP_OF_ROBOTS: Final = (0.0, 0.0, 1.0), "z, as of a robot"
 
 
@@ -93,7 +99,9 @@ class Dataset:
         self.color = choose_images(images, settings.color, False, rate, where)
         self.depth = choose_images(images, settings.depth, True, rate, where)
         self.lens = replace(read_lens(folder / INTRINSICS, 3), size=self.color.feature.size)
-        self._table: tuple[Path, pa.Table] | None = None  # of the file that was read last
+        described = [rate, *(features[key] for key in (self.pose.key, self.color.feature.key, self.depth.feature.key))]
+        self._described = hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()[:16]
+        self._numbers: Numbers | None = None  # of the file that was read last
 
     def captures(self) -> Iterator[Capture]:
         """Yield every episode.
@@ -105,13 +113,15 @@ class Dataset:
             yield self._capture(episode)
 
     def _capture(self, episode: Episode) -> Capture:
-        table, rows = self._rows(episode)
+        numbers, rows = self._rows(episode)
         where = f"{episode.data}: episode {episode.number}"
         try:
-            times = [float(time) for time in table["timestamp"].to_pylist()]
+            times = [float(time) for time in numbers.values("timestamp", rows)]
+            if not all(abs(time) < LATEST for time in times):
+                raise ValueError(f"not all are finite, and below {LATEST:g} s")
         except (TypeError, ValueError) as error:
             raise DataError(f"{where}: its timestamps are no times ({error})") from error
-        poses = self.pose.poses(table[self.pose.key].to_pylist(), where)
+        poses = self.pose.poses(numbers.values(self.pose.key, rows), where)
         color, depth = (self._stored(images, episode, rows, times) for images in (self.color, self.depth))
         depth_lens = None if self.depth.feature.size == self.color.feature.size else self.lens
         frames = [
@@ -125,8 +135,13 @@ class Dataset:
             folder=self.folder,
             scene=f"{name}-{part}" if alone else name,
             frames=frames,
-            files=[self.path, self.folder / INTRINSICS, episode.data, *videos],
-            source={"format": "lerobot", "episode": episode.number, "settings": asdict(self.settings)},
+            files=[self.folder / INTRINSICS, episode.data, *videos],  # not the description: it counts all episodes
+            source={
+                "format": "lerobot",
+                "episode": episode.number,
+                "settings": asdict(self.settings),
+                "features": self._described,
+            },
             part="" if alone else part,
         )
 
@@ -145,56 +160,105 @@ class Dataset:
         columns += [f"videos/{key}/{name}" for key in videos for name in (*CHUNK_AND_FILE, "from_timestamp")]
         folder = self.path.parent / EPISODES
         paths = sorted(folder.glob("*/*.parquet"))
-        if not paths:
-            raise DataError(f"{folder}: no episodes in it; the recording was perhaps not finalized")
+        seen = set[int]()
         for path in paths:
-            for row in _read_columns(path, columns).to_pylist():
+            table = _read_columns(path, columns)
+            with parquet_errors(path):
+                rows = table.to_pylist()
+            for row in rows:
                 try:
-                    yield self._episode(row, videos)
+                    episode = self._episode(row, videos)
                 except (TypeError, ValueError, OverflowError) as error:
                     raise DataError(f"{path}: an episode is damaged ({error})") from error
+                if episode.number in seen:
+                    raise DataError(f"{path}: two episodes of the number {episode.number}")
+                seen.add(episode.number)
+                yield episode
+        if not seen:
+            raise DataError(f"{folder}: no episodes in it; the recording was perhaps not finalized")
 
     def _episode(self, row: Mapping[str, Any], videos: Sequence[str]) -> Episode:
         return Episode(
             number=int(row["episode_index"]),
             length=int(row["length"]),
             data=self._file("data_path", row, "data"),
-            videos={
-                key: (self._file("video_path", row, f"videos/{key}", key), float(row[f"videos/{key}/from_timestamp"]))
-                for key in videos
-            },
+            videos={key: self._video(row, key) for key in videos},
         )
+
+    def _video(self, row: Mapping[str, Any], key: str) -> tuple[Path, float]:
+        """The video of an episode, and the second at which the episode begins there."""
+        start = float(row[f"videos/{key}/from_timestamp"])
+        if not abs(start) < LATEST:
+            raise ValueError(f"it begins at {start:g} s of a video")
+        return self._file("video_path", row, f"videos/{key}", key), start
 
     def _file(self, template: str, row: Mapping[str, Any], columns: str, key: str = "") -> Path:
         """A file by its template in the description; ``DataError`` when that leads nowhere in the dataset."""
         numbers = {name: int(row[f"{columns}/{name}"]) for name in CHUNK_AND_FILE}
-        try:
-            path = PurePosixPath(self.info[template].format(video_key=key, **numbers))
-        except (AttributeError, KeyError, IndexError, ValueError) as error:
-            raise DataError(f"{self.path}: {template} is no name of a file ({error!r})") from error
+        text = self.info.get(template)
+        name = text.format(video_key=key, **numbers) if isinstance(text, str) and _is_template(text) else ""
+        if not name.isprintable() or not 0 < len(name) <= LONGEST_PATH:
+            raise DataError(f"{self.path}: {template} is no name of a file")
+        path = PurePosixPath(name)
         if path.is_absolute() or ".." in path.parts:
             raise DataError(f"{self.path}: {template} leads out of the dataset, to {path}")
         return self.folder / path
 
-    def _rows(self, episode: Episode) -> tuple[pa.Table, list[int]]:
-        """The rows of an episode, and their numbers in the file."""
+    def _rows(self, episode: Episode) -> tuple[Numbers, list[int]]:
+        """The file of an episode's numbers, and which of its rows they are."""
         path = episode.data
-        if self._table is None or self._table[0] != path:
-            self._table = path, _read_columns(path, ["episode_index", "timestamp", self.pose.key])
-        table = self._table[1]
-        rows = np.flatnonzero(table["episode_index"].to_numpy() == episode.number)
-        if not len(rows) or len(rows) != episode.length:
+        if self._numbers is None or self._numbers.path != path:
+            self._numbers = Numbers(path, ["timestamp", self.pose.key])
+        rows = self._numbers.rows(episode.number)
+        if not rows or len(rows) != episode.length:
             raise DataError(
                 f"{path}: {len(rows)} rows of episode {episode.number}, which has {episode.length} frames by "
                 f"{META}/{EPISODES}"
             )
-        return table.take(rows), [int(row) for row in rows]
+        return self._numbers, rows
+
+
+class Numbers:
+    """Columns of a file that holds many episodes.
+
+    Args:
+        path: the file.
+        columns: their names.
+
+    Raises:
+        DataError: when it is missing or damaged, or lacks one.
+    """
+
+    def __init__(self, path: Path, columns: Sequence[str]) -> None:
+        self.path = path
+        self._table = _read_columns(path, ["episode_index", *columns])
+        with parquet_errors(path):
+            numbers = column(self._table, "episode_index", path).cast(pa.int64()).to_numpy()
+        self._order = np.argsort(numbers, kind="stable")
+        self._sorted = numbers[self._order]
+
+    def rows(self, episode: int) -> list[int]:
+        """The rows of an episode, in the file's order."""
+        first, end = (int(np.searchsorted(self._sorted, episode, side)) for side in ("left", "right"))
+        return [int(row) for row in self._order[first:end]]
+
+    def values(self, name: str, rows: Sequence[int]) -> list[Any]:
+        """What some rows of a column hold; ``DataError`` when that is damaged."""
+        with parquet_errors(self.path):
+            return list(column(self._table, name, self.path).take(pa.array(rows, pa.int64())).to_pylist())
+
+
+def _is_template(text: str) -> bool:
+    """Whether a text is a file's name but for fields of numbers and the video's key, as short as LeRobot's are."""
+    return len(text) <= LONGEST_PATH and not re.search(r"[{}\\:]", FIELD.sub("", text))
 
 
 def _read_columns(path: Path, columns: Sequence[str]) -> pa.Table:
     """The columns of a file; ``DataError`` when it is damaged or lacks one."""
+    if path.exists() and not path.is_file():  # one that never ends would be waited for
+        raise DataError(f"{path}: not a file")
     with parquet_errors(path), pq.ParquetFile(path) as file:
         table = file.read(columns=list(dict.fromkeys(columns)))
-    if missing := [name for name in columns if name not in table.column_names]:
-        raise DataError(f"{path}: no column {missing[0]!r}")
+    for name in columns:
+        column(table, name, path)
     return table

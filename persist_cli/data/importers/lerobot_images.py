@@ -10,7 +10,7 @@ from __future__ import annotations
 import bisect
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,12 +22,15 @@ import pyarrow.parquet as pq
 from persist_cli.data.importers.lenses import Array, Size
 from persist_cli.data.importers.readers import StoredImage, decode_channel, decode_color
 from persist_cli.data.importers.videos import TimedPictures
-from persist_cli.data.parquet import parquet_errors
+from persist_cli.data.parquet import column, parquet_errors
 from persist_cli.errors import DataError, hint
 
 VIDEO: Final = "video"
 IMAGE: Final = "image"
 BITS: Final = 12  # of depth in a video
+LONGEST_SIDE: Final = 2**16  # pixels of an image
+FARTHEST: Final = 1e6  # metres that a code may stand for
+ROWS: Final = 16  # of images that are read at once
 DEPTH: Final = {"depth_min": 0.01, "depth_max": 10.0, "shift": 3.5}  # metres, where the feature does not say
 PER_METRE: Final = {"mm": 1000.0, "m": 1.0}
 NEAR: Final = 0.4  # of the time between two frames: by so much may a picture's time differ
@@ -58,7 +61,7 @@ class ImageFeature:
         shape = [int(number) for number in feature["shape"]]
         first = len(shape) == 3 and shape[0] in (1, 3) and shape[2] not in (1, 3)  # the channels
         size = tuple(shape[1:] if first else shape[:2])
-        if len(shape) not in (2, 3) or min(size) < 1:
+        if len(shape) not in (2, 3) or not 1 <= min(size) <= max(size) <= LONGEST_SIDE:
             raise ValueError(f"{shape} is the shape of no image")
         is_depth = info.get("is_depth_map") or any(part.get("video.is_depth_map") for part in (info, legacy))
         return ImageFeature(key, feature["dtype"], (size[0], size[1]), bool(is_depth), info)
@@ -86,7 +89,12 @@ class DepthCode:
         nearest, farthest, shift = (float(_given(feature, name, value)) for name, value in DEPTH.items())
         code = DepthCode(nearest, farthest, shift, bool(_given(feature, "use_log", True)))
         lowest = nearest + (shift if code.by_logarithm else 0.0)
-        if not (0 <= nearest < farthest < math.inf and lowest >= 0 and (lowest > 0 or not code.by_logarithm)):
+        if not (
+            0 <= nearest < farthest <= FARTHEST
+            and abs(shift) <= FARTHEST
+            and lowest >= 0
+            and (lowest > 0 or not code.by_logarithm)
+        ):
             raise ValueError(f"from {nearest:g} to {farthest:g} m with a shift of {shift:g} m")
         return code
 
@@ -142,8 +150,9 @@ class ColumnImages:
     def __init__(self, feature: ImageFeature, as_depth: bool) -> None:
         self.feature = feature
         self._as_depth = as_depth
-        self._group: tuple[Path, int] | None = None  # the group of rows that was read last
-        self._files: list[Any] = []  # of its images
+        self._path: Path | None = None
+        self._first, self._files = 0, list[Any]()  # the images of the rows that were read last, and the first's number
+        self._batches: Iterator[tuple[int, list[Any]]] = iter(())
 
     def image(self, path: Path, row: int) -> StoredImage:
         """The image in a row of a file."""
@@ -165,15 +174,26 @@ class ColumnImages:
 
     def _file(self, path: Path, row: int) -> bytes | None:
         """What stands for a row's image in the file."""
+        if path != self._path or not self._first <= row <= self._first + len(self._files) + ROWS:
+            self._files, self._batches = [], self._read_from(path, row)
+        self._path = None
+        while not self._files or row >= self._first + len(self._files):
+            self._first, self._files = next(self._batches, (row, [None]))
+        self._path = path
+        image = self._files[row - self._first]
+        return image.get("bytes") if isinstance(image, dict) else None
+
+    def _read_from(self, path: Path, row: int) -> Iterator[tuple[int, list[Any]]]:
+        """The column from the group of a row on, a few rows at once: the number of the first one and what they hold."""
         with parquet_errors(path), pq.ParquetFile(path) as file:
             sizes = [file.metadata.row_group(group).num_rows for group in range(file.num_row_groups)]
             ends = list(itertools.accumulate(sizes))
             group = bisect.bisect_right(ends, row)
-            if self._group != (path, group):
-                self._files = file.read_row_group(group, columns=[self.feature.key])[self.feature.key].to_pylist()
-                self._group = path, group
-        image = self._files[row - ends[group] + sizes[group]]
-        return image.get("bytes") if isinstance(image, dict) else None
+            first, groups = sum(sizes[:group]), range(group, len(sizes))
+            for batch in file.iter_batches(ROWS, row_groups=groups, columns=[self.feature.key], use_threads=False):
+                files = column(batch, self.feature.key, path).to_pylist()
+                yield first, files
+                first += len(files)
 
 
 Images = VideoImages | ColumnImages
@@ -191,7 +211,7 @@ def image_features(features: Mapping[str, Any], where: str) -> dict[str, ImageFe
             for key, feature in features.items()
             if feature["dtype"] in (IMAGE, VIDEO)
         }
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
         raise DataError(f"{where}: a feature is damaged ({error!r})") from error
 
 
@@ -221,7 +241,7 @@ def choose_images(features: Mapping[str, ImageFeature], named: str, as_depth: bo
         raise DataError(f"{where}: the video {feature.key!r} is not marked as depth (is_depth_map)")
     try:
         return VideoImages(feature, as_depth, rate)
-    except (TypeError, ValueError) as error:
+    except (OverflowError, TypeError, ValueError) as error:
         raise DataError(f"{where}: {feature.key!r} is no depth that can be read ({error})") from error
 
 

@@ -14,11 +14,16 @@ from scipy.spatial.transform import Rotation
 from persist_cli.data.importers.captures import OPENCV_FROM_OPENGL, checked_pose, quaternion_pose
 from persist_cli.data.importers.lenses import Array
 from persist_cli.data.importers.lerobot_images import IMAGE, VIDEO
+from persist_cli.data.storable import shown
 from persist_cli.errors import DataError, hint
 from persist_cli.io.files import read_json
 
 VERSION: Final = "v3."
 PLANAR, QUATERNION, MATRIX = 3, 7, 16  # numbers of a pose
+MOST_BYTES: Final = 2**25  # of the description
+MOST_FEATURES: Final = 1000
+MOST_NUMBERS: Final = 2**16  # of a feature along an axis
+RATES: Final = (1e-3, 1e5)  # frames a second
 FORMS: Final = (PLANAR, QUATERNION, MATRIX)
 ROBOT: Final = "robot"
 ROBOT_FROM_OPENCV: Final = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -56,11 +61,13 @@ class PoseFeature:
 
     Args:
         key: its name.
-        numbers: which of its numbers are the pose, in order.
+        count: how many numbers it has.
+        numbers: which of these are the pose, in order.
         body_from_camera: ``[4, 4]``, of what has this pose.
     """
 
     key: str
+    count: int
     numbers: Sequence[int]
     body_from_camera: Array
 
@@ -79,15 +86,20 @@ class PoseFeature:
         names = _names(features[key])
         if missing := [name for name in settings.names if name not in names]:
             raise DataError(f"{where}: {key!r} has no number {missing[0]!r}; {hint(missing[0], names, 'it has')}")
-        numbers = [names.index(name) for name in settings.names] or list(range(_count(features[key])))
+        count = _count(features[key])
+        numbers = [names.index(name) for name in settings.names] or range(count)
         if len(numbers) not in FORMS:
             raise DataError(
                 f"{where}: {len(numbers)} numbers of {key!r}, a pose has 3, 7 or 16; --set names=[…] picks some"
             )
         if len(numbers) == PLANAR and settings.axes != ROBOT:
             raise DataError(f"{where}: x, y and yaw are of a robot; give --set axes={ROBOT}")
+        if any(settings.mount) and settings.axes != ROBOT:
+            raise DataError(f"mount: is of a robot's camera; give --set axes={ROBOT}")
+        if not np.isfinite(settings.mount).all():
+            raise DataError(f"mount: {list(settings.mount)} are not four finite numbers")
         camera = {"opencv": np.eye(4), "opengl": OPENCV_FROM_OPENGL, ROBOT: _camera_of_robot(settings.mount)}
-        return PoseFeature(key, numbers, camera[settings.axes])
+        return PoseFeature(key, count, numbers, camera[settings.axes])
 
     def poses(self, values: Sequence[Any], where: str) -> list[Array | DataError]:
         """world_from_camera ``[4, 4]`` of each frame, or why it cannot be used.
@@ -100,28 +112,32 @@ class PoseFeature:
             DataError: when they are not as many numbers as the dataset says.
         """
         try:
-            numbers = np.array(values, dtype=np.float64).reshape(len(values), -1)[:, self.numbers]
-        except (IndexError, TypeError, ValueError) as error:
+            numbers = np.array(values, dtype=np.float64).reshape(len(values), self.count)[:, self.numbers]
+        except (IndexError, OverflowError, TypeError, ValueError) as error:
             raise DataError(f"{where}: {self.key!r} does not hold the numbers that it should ({error})") from error
         poses = [_pose(row, f"{where}, frame {number}") for number, row in enumerate(numbers.tolist())]
         return [pose if isinstance(pose, DataError) else pose @ self.body_from_camera for pose in poses]
 
 
 def read_info(path: Path) -> dict[str, Any]:
-    """The values of ``meta/info.json``, with ``fps`` above 0 and a dictionary of ``features``.
+    """The values of ``meta/info.json``, with ``fps`` as a number above 0 and a dictionary of ``features``.
 
     Raises:
         DataError: when it is missing or damaged, or of another version.
     """
+    if path.exists() and (not path.is_file() or path.stat().st_size > MOST_BYTES):
+        raise DataError(f"{path}: not a file of {MOST_BYTES // 2**20} MB at most, as of a LeRobot dataset")
     info = read_json(path, DataError)
     version = info.get("codebase_version") if isinstance(info, dict) else None
     if not str(version).startswith(VERSION):
         raise DataError(
-            f"{path}: of version {version}; {VERSION}0 and later are read, to which LeRobot converts others"
+            f"{path}: of version {shown(version)}; {VERSION}0 and later are read, to which LeRobot converts others"
         )
     rate, features = info.get("fps"), info.get("features")
-    if not isinstance(rate, int | float) or not 0 < rate < math.inf or not isinstance(features, dict):
+    if not isinstance(rate, int | float) or not RATES[0] <= rate <= RATES[1] or not isinstance(features, dict):
         raise DataError(f"{path}: no frames a second, or no features")
+    if len(features) > MOST_FEATURES:
+        raise DataError(f"{path}: {len(features)} features, a dataset has {MOST_FEATURES} at most")
     return info  # type: ignore[no-any-return]
 
 
@@ -149,13 +165,15 @@ def _camera_of_robot(mount: tuple[float, float, float, float]) -> Array:
 def _count(feature: Any) -> int:
     """How many numbers a feature has in a frame; 0 where it is none of numbers."""
     shape = feature.get("shape") if isinstance(feature, dict) else None
-    if not isinstance(shape, list) or feature.get("dtype") in (IMAGE, VIDEO, "string"):
+    if not isinstance(shape, list) or len(shape) > 2 or feature.get("dtype") in (IMAGE, VIDEO, "string"):
         return 0
-    return math.prod(number for number in shape if isinstance(number, int))
+    return math.prod(number if isinstance(number, int) and 0 < number <= MOST_NUMBERS else 0 for number in shape)
 
 
 def _names(feature: Mapping[str, Any]) -> list[str]:
-    """The names of a feature's numbers, in order."""
+    """The names of a feature's numbers, in order, of which LeRobot's robots give lists, or their places by name."""
     names = feature.get("names") or []
+    if isinstance(names, dict) and sorted(names.values(), key=str) == sorted(range(len(names)), key=str):
+        return sorted(names, key=names.__getitem__)
     groups = names.values() if isinstance(names, dict) else [names]
     return [str(name) for group in groups if isinstance(group, list) for name in group]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,11 +18,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from persist_cli.api.importer import ForeignTrajectory
+from persist_cli.data.importers import videos
 from persist_cli.data.importers.importing import ImportPlan, run_import
 from persist_cli.data.importers.lerobot import LeRobot
-from persist_cli.data.importers.lerobot_images import DepthCode, ImageFeature
+from persist_cli.data.importers.lerobot_images import ColumnImages, DepthCode, ImageFeature
 from persist_cli.data.importers.lerobot_info import LeRobotSettings
-from persist_cli.data.importers.videos import TimedPictures
+from persist_cli.data.importers.readers import decode_color
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError, PersistError
 from persist_cli.plugins import load_plugin
@@ -37,6 +40,7 @@ from tests.support.lerobot_datasets import (
     stored_depth,
     video,
     write_codes,
+    write_later_episode,
     write_lerobot,
 )
 
@@ -170,22 +174,57 @@ def test_codes_in_proportion_are_read_too() -> None:
     assert metres == pytest.approx(np.array([[0, 0.001], [1, 0]], np.float32))  # the last may be farther
 
 
-def test_a_picture_of_a_long_video_is_found_by_its_time(tmp_path: Path) -> None:
-    """Forward, backward and far away, where LeRobot has a key picture every other one."""
-    images = [np.full((32, 32), number, np.uint16) for number in range(100)]
-    write_codes(tmp_path / "a.mp4", images)
-    write_codes(tmp_path / "b.mp4", images[::-1])
-    pictures = TimedPictures()
+def test_a_video_is_decoded_once_where_episodes_follow_each_other(
+    dataset: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened = []
+    decoded = videos.decoded
+    monkeypatch.setattr(videos, "decoded", lambda path, since: opened.append(path) or decoded(path, since))
+    for episode in LeRobot(replace(POSE, axes="robot")).trajectories(dataset):
+        assert len(list(episode.frames)) == episode.length
+    assert sorted(opened) == sorted(video(dataset, key) for key in (COLOR, DEPTH))
 
-    def value(name: str, seconds: float) -> int:
-        return int(pictures.at(tmp_path / name, seconds, 0.04).to_ndarray(format="gray12le")[0, 0])
 
-    assert [value("a.mp4", seconds) for seconds in (0.0, 0.1, 0.13, 9.9, 9.8, 0.0, 5.0)] == [0, 1, 1, 99, 98, 0, 50]
-    assert [value(*place) for place in (("b.mp4", 5.1), ("a.mp4", 5.1), ("b.mp4", 5.2))] == [48, 51, 47]
-    for seconds in (0.05, 10.0, 99.0):
-        with pytest.raises(DataError, match=rf"a.mp4: no picture of {seconds:.3f} s in it"):
-            value("a.mp4", seconds)
-    assert value("a.mp4", 3.0) == 30
+def test_a_video_of_larger_pictures_than_any_camera_takes_is_not_decoded(
+    dataset: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(videos, "MOST_PIXELS", 1000)
+    with pytest.raises(DataError, match=r"file-000.mp4: cannot be read as a video"):
+        read(dataset, replace(POSE, axes="robot"))
+
+
+def test_images_in_one_large_group_of_rows_are_read_a_few_at_once(tmp_path: Path) -> None:
+    many = write_lerobot(tmp_path / "room", (24,), stored="mm")
+    column = ColumnImages(ImageFeature.of(COLOR, {"dtype": "image", "shape": [48, 64, 3]}), as_depth=False)
+    path = many / "data/chunk-000/file-000.parquet"
+    truth = [image["bytes"] for image in pq.read_table(path)[COLOR].to_pylist()]
+    for row in (0, 1, 20, 23, 2, 2, 17):
+        assert np.array_equal(column.image(path, row).read(), decode_color(truth[row], "")), row
+        assert len(column._files) <= 16
+
+
+def test_episodes_that_are_recorded_later_are_added(tmp_path: Path) -> None:
+    settings = {"pose": "observation.pose", "axes": "robot"}
+    dataset = write_lerobot(tmp_path / "room", (3,), "planar")
+    change_info(dataset, lambda info: info.update(total_frames=3))
+    run_import("lerobot", dataset, tmp_path / "out", ImportPlan(), True, settings)
+    write_later_episode(dataset)
+    change_info(dataset, lambda info: info.update(total_frames=1000))  # a description of another size
+    run_import("lerobot", dataset, tmp_path / "out", ImportPlan(), True, settings)
+    assert [len(trajectory) for trajectory in Store(tmp_path / "out")] == [3, 3]
+    change_info(dataset, lambda info: info["features"][DEPTH]["info"].update({"video.depth_max": 9.0}))
+    with pytest.raises(DataError, match="holds another trajectory"):
+        run_import("lerobot", dataset, tmp_path / "out", ImportPlan(), True, settings)
+
+
+def test_names_may_be_given_by_their_places(dataset: Path) -> None:
+    places = {f"p{number}": number for number in reversed(range(7))}
+    change_info(dataset, lambda info: info["features"]["observation.pose"].update(names=places))
+    whole, picked = (
+        read(dataset, replace(POSE, names=names))[0] for names in ((), tuple(f"p{number}" for number in range(7)))
+    )
+    for one, other in zip(whole.frames, picked.frames, strict=True):
+        assert np.array_equal(one.world_from_camera, other.world_from_camera)
 
 
 def change_info(dataset: Path, change: Callable[[dict[str, Any]], object]) -> None:
@@ -208,6 +247,21 @@ def change_table(dataset: Path, place: str, change: Callable[[dict[str, list[Any
 
 def table(place: str, change: Callable[[dict[str, list[Any]]], object]) -> Callable[[Path], None]:
     return lambda dataset: change_table(dataset, place, change)
+
+
+def column(place: str, name: str, values: Any) -> Callable[[Path], None]:
+    """What gives a column other values, or with none writes it twice."""
+
+    def change(dataset: Path) -> None:
+        path = dataset / place / "chunk-000/file-000.parquet"
+        whole = pq.read_table(path)
+        if values is None:
+            whole = whole.append_column(name, whole[name])
+        else:
+            whole = whole.set_column(whole.column_names.index(name), name, values)
+        pq.write_table(whole, path)
+
+    return change
 
 
 def cut(path: Path) -> None:
@@ -235,7 +289,24 @@ def cut(path: Path) -> None:
          f"info.json: '{DEPTH}' is no depth that can be read"),
         (POSE, info(lambda info: info["features"][DEPTH]["info"].update({"video.depth_max": "far"})),
          f"info.json: '{DEPTH}' is no depth that can be read"),
-        (POSE, info(lambda info: info.update(codebase_version="v2.1")), "info.json: of version v2.1; v3.0 and later"),
+        (POSE, info(lambda info: info.update(codebase_version="v2.1")), "info.json: of version 'v2.1'; v3.0 and later"),
+        (POSE, info(lambda info: info.update(fps=10**400)), "info.json: no frames a second, or no features"),
+        (POSE, info(lambda info: info["features"].update({str(number): {} for number in range(1000)})),
+         "info.json: 10.. features, a dataset has 1000 at most"),
+        (POSE, info(lambda info: info["features"]["observation.pose"].update(shape=[10**12])),
+         "0 numbers of 'observation.pose', a pose has 3, 7 or 16"),
+        (POSE, info(lambda info: info["features"]["observation.pose"].update(shape=[10**18] * 300000)), "0 numbers of"),
+        (POSE, info(lambda info: info["features"][COLOR].update(shape=[math.inf, 3, 3])), "a feature is damaged"),
+        (POSE, info(lambda info: info["features"][COLOR].update(shape=[10**400] * 2)), "a feature is damaged"),
+        (POSE, info(lambda info: info["features"][DEPTH]["info"].update({"video.shift": 1e20})), "is no depth that"),
+        (POSE, info(lambda info: info["features"][DEPTH]["info"].update({"video.shift": 10**400})), "is no depth that"),
+        (POSE, info(lambda info: info.update(data_path="{chunk_index:999999999d}")), "data_path is no name of a file"),
+        (POSE, info(lambda info: info.update(video_path="{video_key:999999999}")), "video_path is no name of a file"),
+        (POSE, info(lambda info: info.update(video_path="{video_key.__class__}")), "video_path is no name of a file"),
+        (POSE, info(lambda info: info.update(data_path="\ud800")), "data_path is no name of a file"),
+        (POSE, info(lambda info: info.update(data_path="data")), "room/data: not a file"),
+        (replace(POSE, mount=(0.0, 0.0, 1.0, 0.0)), None, "mount: is of a robot's camera; give --set axes=robot"),
+        (replace(ROBOT, pose="observation.pose", mount=(math.nan, 0.0, 0.0, 0.0)), None, "not four finite numbers"),
         (POSE, info(lambda info: info.update(fps=0)), "info.json: no frames a second, or no features"),
         (POSE, info(lambda info: info.update(data_path="{nothing}")), "info.json: data_path is no name of a file"),
         (POSE, info(lambda info: info.update(video_path=None)), "info.json: video_path is no name of a file"),
@@ -253,6 +324,17 @@ def cut(path: Path) -> None:
         (POSE, table("data", lambda rows: rows.update({"observation.pose": [[1.0, 2.0]] * 7})),
          "episode 0: 'observation.pose' does not hold the numbers that it should"),
         (POSE, table("data", lambda rows: rows.update({"observation.pose": ["here"] * 7})), "does not hold"),
+        (POSE, table("data", lambda rows: rows.update({"observation.pose": [[1.0] * 9] * 7})), "does not hold"),
+        (POSE, table("data", lambda rows: rows.update(episode_index=[[0, 1]] * 7)), "not a whole Parquet file"),
+        (POSE, column("data", "observation.pose", pa.array([b"\xff"] * 7).view(pa.string())), "not a whole Parquet"),
+        (POSE, table("data", lambda rows: rows.update(timestamp=[math.inf] * 7)), "its timestamps are no times"),
+        (POSE, table("data", lambda rows: rows.update(timestamp=[1e30] * 7)), "its timestamps are no times"),
+        (POSE, column("data", "timestamp", pa.array([10**9] * 7, pa.int32()).cast(pa.date32())), "not a whole Parquet"),
+        (POSE, column("data", "timestamp", None), "file-000.parquet: 2 columns 'timestamp'"),
+        (POSE, table("meta/episodes", lambda rows: rows.update(episode_index=[0, 0])), "two episodes of the number 0"),
+        (POSE, table("meta/episodes", lambda rows: [rows[name].clear() for name in rows]), "episodes: no episodes in"),
+        (POSE, table("meta/episodes", lambda rows: rows.update({f"videos/{COLOR}/from_timestamp": [math.inf] * 2})),
+         "file-000.parquet: an episode is damaged"),
         (POSE, table("data", lambda rows: rows.update(timestamp=["now"] * 7)),
          "file-000.parquet: episode 0: its timestamps are no times"),
         (POSE, lambda dataset: cut(dataset / "data/chunk-000/file-000.parquet"), "not a whole Parquet file"),
@@ -312,12 +394,25 @@ def test_a_frame_that_cannot_be_used_is_named_or_left_out(
     assert [len(trajectory) for trajectory in Store(tmp_path / "out")] == left
 
 
+def endless(dataset: Path) -> None:
+    video(dataset, COLOR).unlink()
+    os.mkfifo(video(dataset, COLOR))
+
+
+def playlist(dataset: Path) -> None:
+    """A text of another format, which leads FFmpeg to a file that is none of the dataset's."""
+    video(dataset, COLOR).rename(video(dataset, COLOR).with_name("other.mp4"))
+    video(dataset, COLOR).write_text("ffconcat version 1.0\nfile other.mp4\n")
+
+
 @pytest.mark.parametrize(
     ("breaks", "cause"),
     [
         (wrong_bits, "file-000.mp4: a picture of 8 bits a pixel, depth has 12"),
         (lambda dataset: video(dataset, COLOR).write_bytes(b"none"), "file-000.mp4: cannot be read as a video"),
         (lambda dataset: video(dataset, COLOR).unlink(), "file-000.mp4: no such file"),
+        (endless, "file-000.mp4: not a file"),
+        (playlist, "file-000.mp4: cannot be read as a video"),
     ],
 )
 def test_an_episode_without_one_readable_image_is_one_line(
