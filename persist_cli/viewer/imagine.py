@@ -12,7 +12,6 @@ from typing import Final
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
 from persist_cli.api.checkpoint import PLAIN, Checkpoint, find_checkpoint, reference_checkpoint
@@ -178,6 +177,8 @@ def way_to(first: Float[Tensor, "4 4"], last: Float[Tensor, "4 4"], clip: int) -
         last: that at the end.
         clip: frames of a clip.
     """
+    from scipy.spatial.transform import Rotation, Slerp  # a sixth of the start of a page that imagines nothing
+
     metres, degrees = pose_differences(first.double(), last.double())
     steps = max(float(metres) / STEP, float(degrees) / TURN, 1.0)
     count = clip * min(MOST_CLIPS, math.ceil(steps / clip))

@@ -1,5 +1,7 @@
 """What a world model imagines at a camera that was placed by hand."""
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import pytest
@@ -33,6 +35,11 @@ def test_the_way_ends_at_the_camera_in_steps_as_small_as_those_of_training(walks
 def test_a_camera_far_off_is_reached_with_a_bounded_number_of_clips(walks):
     first = Store(walks)[0].poses()[0]
     assert len(way_to(first, moved(first, 100.0), 8)) == 8 * MOST_CLIPS
+
+
+def test_a_page_that_imagines_nothing_does_without_scipy():
+    code = "import sys, persist_cli.viewer.view; print([name for name in sys.modules if name == 'scipy.spatial'])"
+    assert subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout == "[]\n"
 
 
 def test_it_begins_at_the_nearest_true_frame(walks):
