@@ -65,6 +65,13 @@ def test_a_video_always_has_the_same_400_features(weights):
     assert not torch.equal(features, FVD.features(video.flip(0)))
 
 
+@pytest.mark.parametrize(("window", "stride"), [((1, 3, 3), (1, 2, 2)), ((3,) * 3, (2,) * 3), ((3,) * 3, (1,) * 3)])
+def test_poolings_equal_those_of_torch_to_the_bit(window, stride):
+    state = torch.randn(2, 4, 8, 29, 30, generator=torch.Generator().manual_seed(0))
+    theirs = torch.nn.functional.max_pool3d(state, window, stride)
+    assert torch.equal(i3d.max_pool(state, window, stride), theirs)
+
+
 def test_a_video_of_15_frames_is_one_line():
     with pytest.raises(DataError, match="a video of 15 frames, FVD needs 16"):
         FVD.features(random_frames(0, frames=15)[0])
