@@ -6,7 +6,8 @@ import io
 import json
 import math
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,9 @@ import pyarrow.parquet as pq
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from persist_cli.api.importer import ForeignTrajectory
+from persist_cli.data.importers.lerobot import LeRobot
+from persist_cli.data.importers.lerobot_info import LeRobotSettings
 from tests.support.foreign_captures import FROM_Y_UP
 from tests.support.phone_captures import write_lossless
 from tests.support.rooms import Room, look, walk
@@ -27,6 +31,15 @@ RATE = 10  # frames a second, as of ``write_lossless``
 COLOR, DEPTH = "observation.images.front", "observation.images.front_depth"
 HEIGHT, PITCH = 1.2, -10.0  # of a robot's camera, metres and degrees up
 PLACES = [(0.1 * number, 0.05 * number, 15.0 * number) for number in range(10)]  # x, y, degrees of yaw of a robot
+
+
+POSE = LeRobotSettings(pose="observation.pose")
+ROBOT = replace(POSE, axes="robot", mount=(0.0, 0.0, HEIGHT, PITCH))
+
+
+def read_all(source: Path, settings: LeRobotSettings = POSE) -> list[ForeignTrajectory]:
+    """All episodes, whose images are not read yet."""
+    return list(LeRobot(settings).trajectories(source))
 
 
 def write_lerobot(
@@ -187,3 +200,19 @@ def write_codes(path: Path, images: Sequence[np.ndarray], bits: int = 12, title:
             rows[:, :width] = image
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
+
+
+def change_info(dataset: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Change ``meta/info.json``."""
+    path = dataset / "meta/info.json"
+    info = json.loads(path.read_text())
+    change(info)
+    path.write_text(json.dumps(info))
+
+
+def change_table(dataset: Path, place: str, change: Callable[[dict[str, list[Any]]], object]) -> None:
+    """Change the columns of a table, ``data`` or ``meta/episodes``."""
+    path = dataset / place / "chunk-000/file-000.parquet"
+    columns = pq.read_table(path).to_pydict()
+    change(columns)
+    pq.write_table(pa.table(columns), path)

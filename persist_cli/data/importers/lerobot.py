@@ -101,16 +101,22 @@ class Dataset:
         self.lens = replace(read_lens(folder / INTRINSICS, 3), size=self.color.feature.size)
         described = [rate, *(features[key] for key in (self.pose.key, self.color.feature.key, self.depth.feature.key))]
         self._described = hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()[:16]
+        self._chosen = settings.chosen_episodes()
         self._numbers: Numbers | None = None  # of the file that was read last
 
     def captures(self) -> Iterator[Capture]:
-        """Yield every episode.
+        """Yield every episode that is to be read.
 
         Raises:
-            DataError: when a file of it is missing or damaged, or none of its poses can be used.
+            DataError: when there is none, a file of one is missing or damaged, or none of its poses can be used.
         """
+        chosen = 0
         for episode in self._episodes():
-            yield self._capture(episode)
+            if self._chosen is None or episode.number in self._chosen:
+                chosen += 1
+                yield self._capture(episode)
+        if not chosen:
+            raise DataError(f"{self.path.parent / EPISODES}: has no episode {self.settings.episodes}")
 
     def _capture(self, episode: Episode) -> Capture:
         numbers, rows = self._rows(episode)
@@ -139,7 +145,7 @@ class Dataset:
             source={
                 "format": "lerobot",
                 "episode": episode.number,
-                "settings": asdict(self.settings),
+                "settings": {key: value for key, value in asdict(self.settings).items() if key != "episodes"},
                 "features": self._described,
             },
             part="" if alone else part,

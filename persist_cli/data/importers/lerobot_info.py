@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,7 @@ MOST_NUMBERS: Final = 2**16  # of a feature along an axis
 RATES: Final = (1e-3, 1e5)  # frames a second
 FORMS: Final = (PLANAR, QUATERNION, MATRIX)
 ROBOT: Final = "robot"
+EPISODES: Final = re.compile(r"(?P<first>\d{1,9})(?:-(?P<end>\d{1,9}))?")
 ROBOT_FROM_OPENCV: Final = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
 
@@ -44,6 +46,7 @@ class LeRobotSettings:
         color: the feature of the colours; the only one that is no depth when empty.
         depth: the feature of the depth; the only one when empty.
         scene: whether all episodes show one scene, ``dataset``, or each one of its own, ``episode``.
+        episodes: which are read: one, ``7``, or from the first to before the last, ``0-50``; all when empty.
     """
 
     pose: str = ""
@@ -53,6 +56,21 @@ class LeRobotSettings:
     color: str = ""
     depth: str = ""
     scene: Literal["dataset", "episode"] = "dataset"
+    episodes: str | int = ""
+
+    def chosen_episodes(self) -> range | None:
+        """The numbers of the episodes to read, ``None`` for all.
+
+        Raises:
+            DataError: when they are no numbers.
+        """
+        if self.episodes == "":
+            return None
+        match = EPISODES.fullmatch(str(self.episodes))
+        if match is None:
+            raise DataError(f"episodes: {self.episodes!r} is neither a number nor a range as in 0-50")
+        first = int(match["first"])
+        return range(first, int(match["end"]) if match["end"] else first + 1)
 
 
 @dataclass(frozen=True)
