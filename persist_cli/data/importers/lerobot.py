@@ -23,7 +23,7 @@ from persist_cli.api.importer import ForeignTrajectory, Importer
 from persist_cli.data.importers.captures import Capture, CapturedFrame, folders_with, world_up_of
 from persist_cli.data.importers.lerobot_images import Images, VideoImages, choose_images, image_features
 from persist_cli.data.importers.lerobot_info import ROBOT, LeRobotSettings, PoseFeature, read_info
-from persist_cli.data.importers.readers import INTRINSICS, StoredImage, read_lens
+from persist_cli.data.importers.readers import INTRINSICS, StoredImage, check_file, read_lens
 from persist_cli.data.parquet import column, parquet_errors
 from persist_cli.errors import DataError
 
@@ -239,7 +239,7 @@ class Numbers:
         self.path = path
         self._table = _read_columns(path, ["episode_index", *columns])
         with parquet_errors(path):
-            numbers = column(self._table, "episode_index", path).cast(pa.int64()).to_numpy()
+            numbers = self._table["episode_index"].cast(pa.int64()).to_numpy()
         self._order = np.argsort(numbers, kind="stable")
         self._sorted = numbers[self._order]
 
@@ -251,7 +251,7 @@ class Numbers:
     def values(self, name: str, rows: Sequence[int]) -> list[Any]:
         """What some rows of a column hold; ``DataError`` when that is damaged."""
         with parquet_errors(self.path):
-            return list(column(self._table, name, self.path).take(pa.array(rows, pa.int64())).to_pylist())
+            return list(self._table[name].take(pa.array(rows, pa.int64())).to_pylist())
 
 
 def _is_template(text: str) -> bool:
@@ -261,8 +261,7 @@ def _is_template(text: str) -> bool:
 
 def _read_columns(path: Path, columns: Sequence[str]) -> pa.Table:
     """The columns of a file; ``DataError`` when it is damaged or lacks one."""
-    if path.exists() and not path.is_file():  # one that never ends would be waited for
-        raise DataError(f"{path}: not a file")
+    check_file(path)
     with parquet_errors(path), pq.ParquetFile(path) as file:
         table = file.read(columns=list(dict.fromkeys(columns)))
     for name in columns:

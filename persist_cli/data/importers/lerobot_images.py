@@ -88,13 +88,8 @@ class DepthCode:
         """The code of a feature; ``ValueError`` when its numbers are none of a code."""
         nearest, farthest, shift = (float(_given(feature, name, value)) for name, value in DEPTH.items())
         code = DepthCode(nearest, farthest, shift, bool(_given(feature, "use_log", True)))
-        lowest = nearest + (shift if code.by_logarithm else 0.0)
-        if not (
-            0 <= nearest < farthest <= FARTHEST
-            and abs(shift) <= FARTHEST
-            and lowest >= 0
-            and (lowest > 0 or not code.by_logarithm)
-        ):
+        has_logarithm = nearest + shift > 0 or not code.by_logarithm
+        if not (0 <= nearest < farthest <= FARTHEST and abs(shift) <= FARTHEST and has_logarithm):
             raise ValueError(f"from {nearest:g} to {farthest:g} m with a shift of {shift:g} m")
         return code
 

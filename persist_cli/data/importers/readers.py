@@ -43,6 +43,12 @@ class StoredImage:
         return f"{self.path}: {self.place}" if self.place else str(self.path)
 
 
+def check_file(path: Path) -> None:
+    """Raise ``DataError`` where something else than a file is: a pipe would be waited for without end."""
+    if path.exists() and not path.is_file():
+        raise DataError(f"{path}: not a file")
+
+
 def color_file(path: Path) -> StoredImage:
     """The colour image of a file."""
     return StoredImage(path, partial(read_color, path))

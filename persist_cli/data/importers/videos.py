@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from persist_cli.data.importers.lenses import Array, Size
-from persist_cli.data.importers.readers import StoredImage
+from persist_cli.data.importers.readers import StoredImage, check_file
 from persist_cli.errors import DataError
 
 FORMATS: Final = "mov,matroska,avi"  # of FFmpeg; playlists and the like are none, as they name other files
@@ -110,8 +110,7 @@ def decoded(path: Path, since: float = 0.0) -> Iterator[Any]:
     """
     import av
 
-    if path.exists() and not path.is_file():  # one that never ends would be waited for
-        raise DataError(f"{path}: not a file")
+    check_file(path)
     try:
         options = {"format_whitelist": FORMATS}
         with av.open(str(path.absolute()), options=options, metadata_errors="replace") as container:
