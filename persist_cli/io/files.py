@@ -7,6 +7,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import shutil
 import time
 import uuid
@@ -25,8 +26,13 @@ ASIDE: Final = ".partial-"  # the beginning of the names of files and folders th
 ENVIRONMENT: Final = "PERSIST_REFERENCE"  # a folder that holds the bundled model and data instead of the package
 
 
+SCHEME: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:")  # how an address begins; drives of Windows have one letter
+
+
 def check_folder(path: Path) -> None:
     """Raise ``PersistError`` when this folder cannot be made or written into, before any work is done."""
+    if len(path.parts) > 1 and SCHEME.fullmatch(path.parts[0]) and not Path(path.parts[0]).exists():
+        raise PersistError(f"{path}: an address; only folders of this machine are written into, choose another --out")
     nearest = next((folder for folder in (path, *path.parents) if folder.exists()), path)
     if nearest.exists() and not nearest.is_dir():
         raise PersistError(f"{path}: no folder can be made there, {nearest} is a file; choose another --out")

@@ -30,7 +30,7 @@ from persist_cli.api.simulator import Simulator, random_ground
 from persist_cli.data.images import LARGEST_SIDE
 from persist_cli.data.store import write_trajectory
 from persist_cli.errors import DataError
-from persist_cli.io.files import read_json, remove_leftovers, write_json
+from persist_cli.io.files import check_folder, read_json, remove_leftovers, write_json
 from persist_cli.output.console import add_task, print_json, progress, say
 from persist_cli.plugins import check_simulator, list_plugins, load_plugin, make_settings, plugin_errors
 from persist_cli.simulators.checked import checked_simulator
@@ -224,8 +224,7 @@ def claim_folder(plan: CollectPlan, out: Path) -> None:
     """
     file = out / PLAN_FILE
     settings = {"version": VERSION, **plan.to_json()}
-    if out.exists() and not out.is_dir():
-        raise DataError(f"{out}: is no folder")
+    check_folder(out)
     if file.exists():
         _compare(settings, read_json(file), file)
     elif out.is_dir() and any(out.glob("*.parquet")):

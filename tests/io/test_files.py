@@ -13,10 +13,11 @@ from safetensors.torch import load_file, save_file
 
 from persist_backbones.pipeline.pipeline import WorldPipeline
 from persist_cli.checkpoints import save
-from persist_cli.errors import CheckpointError
+from persist_cli.errors import CheckpointError, PersistError
 from persist_cli.io import files
 from persist_cli.io.files import (
     ASIDE,
+    check_folder,
     folder_aside,
     read_json,
     read_tensors,
@@ -165,6 +166,17 @@ def test_only_leftovers_of_the_given_name_are_removed(tmp_path):
     assert len(list(tmp_path.iterdir())) == 3
     remove_leftovers(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["m"]
+
+
+def test_nothing_is_written_to_an_address(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for address in ("s3://bucket/houses", "https://host/x"):
+        with pytest.raises(PersistError, match="an address; only folders of this machine are written into"):
+            check_folder(Path(address))
+    for folder in ("runs/s3:/x", "C:/houses", "s3:", "/s3:/x"):
+        check_folder(Path(folder))
+    (tmp_path / "s3:").mkdir()
+    check_folder(Path("s3://bucket/houses"))  # a folder that is there
 
 
 def test_a_failed_write_leaves_no_folder_that_was_made_for_it_and_every_other(tmp_path):
