@@ -187,7 +187,7 @@ def finetune(
     context: typer.Context,
     recipe: Annotated[str, typer.Argument(help="A recipe's name (`persist recipes`) or a YAML file.")],
     overrides: Annotated[list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Settings to change.")] = None,
-    data: Annotated[list[Path] | None, typer.Option(help="Data set folder; may be given again.")] = None,
+    data: Annotated[list[str] | None, typer.Option(help="Data set, a folder or address; may be given again.")] = None,
     out: Annotated[Path | None, typer.Option(help="Run folder.")] = None,
     resume: Annotated[bool, typer.Option(help="Go on from the run's last checkpoint.")] = False,
     cache: Annotated[

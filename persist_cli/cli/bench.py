@@ -214,7 +214,7 @@ def bench_scene(
     context: typer.Context,
     data: Annotated[str, typer.Option(help="Test houses with cells, as `persist collect miniworld` writes them.")],
     model: Annotated[str | None, typer.Argument(help="A scene model; without one only the other rows.")] = None,
-    train: Annotated[Path | None, typer.Option(help="Training houses, for the rows that look them up.")] = None,
+    train: Annotated[str | None, typer.Option(help="Training houses, for the rows that look them up.")] = None,
     parts: Annotated[str, typer.Option(help="Of completion, walk, speed, return, edits, evolution.")] = "completion",
     images: Annotated[int, typer.Option(min=1, help="Most images, each of another house.")] = 32,
     seeds: Annotated[int, typer.Option(min=1, help="Completions, and walks, of each image; edits have one each.")] = 3,

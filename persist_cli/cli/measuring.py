@@ -38,7 +38,7 @@ measuring_app = typer.Typer()
 def evaluate(
     context: typer.Context,
     checkpoints: CheckpointsArgument = None,
-    data: Annotated[list[Path] | None, typer.Option(help="Data set of held-out scenes; may be given again.")] = None,
+    data: Annotated[list[str] | None, typer.Option(help="Data set of held-out scenes; may be given again.")] = None,
     protocol: Annotated[str, typer.Option(help="revisit, return, long, unseen or later.")] = "revisit",
     memories: MemoriesOption = None,
     controls: ControlsOption = None,

@@ -5,10 +5,13 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Final
 
 import pyarrow as pa
 
 from persist_cli.errors import DataError
+
+SUFFIX: Final = ".parquet"
 
 
 @contextlib.contextmanager

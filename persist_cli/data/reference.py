@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from persist_cli.api.observations import Trajectory
-from persist_cli.data.store import SUFFIX, Store, TrajectoryFile
+from persist_cli.data.mirror import is_address, mirror
+from persist_cli.data.parquet import SUFFIX
+from persist_cli.data.store import Store, TrajectoryFile
 from persist_cli.errors import DataError
 from persist_cli.io.files import bundled_folder
 
@@ -79,15 +81,16 @@ class Reference:
 
 
 def parse_reference(text: str) -> Reference:
-    """The reference of a text form; nothing is opened yet.
+    """The reference of a text form; nothing is opened yet, but an address is listed.
 
     Args:
-        text: DATA is a folder, or ``sample``; the trajectory is a name or a number (a name that is a number wins);
-            frames are ``12``, or ``0-48`` where frame 48 is not included. A folder of all the text, ``#`` included,
-            wins.
+        text: DATA is a folder, an address as in ``https://…``, or ``sample``; the trajectory is a name or a number (a
+            name that is a number wins); frames are ``12``, or ``0-48`` where frame 48 is not included. A folder of all
+            the text, ``#`` included, wins.
 
     Raises:
-        DataError: when it is not of this form, or names the packaged sample and there is none.
+        DataError: when it is not of this form, or names the packaged sample and there is none, or an address cannot be
+            listed.
     """
     folder, sharp, rest = text.rpartition("#")
     if not sharp or Path(text).is_dir():
@@ -103,9 +106,13 @@ def parse_reference(text: str) -> Reference:
 def data_folder(text: str) -> Path:
     """The folder of a data set; ``sample`` is the one that comes with the package unless such a folder is here.
 
+    That of an address, as in ``https://…``, mirrors what is read of it.
+
     Raises:
-        DataError: when the packaged sample is named and this installation has none.
+        DataError: when the packaged sample is named and this installation has none, or an address cannot be listed.
     """
+    if is_address(text):
+        return mirror(text)
     folder = Path(text)
     if text == SAMPLE and not folder.is_dir():
         return sample_data()

@@ -22,14 +22,14 @@ from persist_cli.api.cameras import Cameras, check_poses
 from persist_cli.api.cells import CellForm, CellGrid
 from persist_cli.api.observations import Frame, Observations, Trajectory, TrajectoryInfo
 from persist_cli.data.images import decode_depth, decode_rgb, encode_depth, encode_rgb
-from persist_cli.data.parquet import parquet_errors
+from persist_cli.data.mirror import fetched, file_size, header, mirrored
+from persist_cli.data.parquet import SUFFIX, parquet_errors
 from persist_cli.data.storable import check_frame, check_info
 from persist_cli.data.store_header import CELLS, COLUMNS, METADATA_KEY, read_info, schema
 from persist_cli.data.stored_cells import CellBox, encode_cells
 from persist_cli.errors import DataError, nearest_name
-from persist_cli.io.files import ASIDE, written_aside
+from persist_cli.io.files import ASIDE, file_sha256, written_aside
 
-SUFFIX = ".parquet"
 OF_A_FRAME = ("rgb.bytes", "depth.bytes", "world_from_camera", "action")  # columns that ``read`` needs
 FRAMES_PER_GROUP = 8  # a clip of a few frames reads little more than itself
 
@@ -98,6 +98,16 @@ class TrajectoryFile:
     def length(self) -> int:
         """Number of frames."""
         return int(self._metadata.num_rows)
+
+    @property
+    def file_size(self) -> int:
+        """Bytes of its file, which need not be fetched yet."""
+        return file_size(self.path)
+
+    @property
+    def sha256(self) -> str:
+        """The SHA-256 of its file."""
+        return file_sha256(fetched(self.path))
 
     @cached_property
     def info(self) -> TrajectoryInfo:
@@ -207,7 +217,8 @@ class TrajectoryFile:
     @cached_property
     def _metadata(self) -> Any:
         with parquet_errors(self.path):
-            metadata = pq.read_metadata(self.path.absolute())  # what begins with a name and a colon might be an address
+            # what begins with a name and a colon might be an address
+            metadata = pq.read_metadata(header(self.path).absolute())
         missing = set(COLUMNS.names) - set(metadata.schema.to_arrow_schema().names)
         if METADATA_KEY in (metadata.metadata or {}) and missing:
             raise DataError(f"{self.path}: its columns {', '.join(sorted(missing))} are missing")
@@ -265,7 +276,7 @@ class TrajectoryFile:
             return list(file.read(columns=[name], use_threads=False)[name].to_pylist())
 
     def _open(self) -> Any:
-        return pq.ParquetFile(self.path.absolute(), metadata=self._metadata, page_checksum_verification=True)
+        return pq.ParquetFile(fetched(self.path).absolute(), metadata=self._metadata, page_checksum_verification=True)
 
     def _image(
         self, cell: dict[str, bytes], decode: Callable[[bytes], np.ndarray[Any, Any]], number: int
@@ -331,7 +342,10 @@ def _checked_rows(path: Path, info: TrajectoryInfo, frames: Iterable[Frame]) -> 
 
 
 def _trajectory_paths(folder: Path) -> list[Path]:
-    """The folder's files in the order of their names, without those that a writer left aside."""
+    """The folder's files, or those listed of a mirror, by name and without those that a writer left aside."""
+    files = mirrored(folder)
+    if files is not None:
+        return [folder / name for name in files]
     return sorted(path for path in folder.glob(f"*{SUFFIX}") if not path.name.startswith(ASIDE))
 
 

@@ -16,8 +16,8 @@ from persist_cli.api.backbone import Interactions
 from persist_cli.api.geometry import pose_differences
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.data.clips import interactions_of
-from persist_cli.data.store import SUFFIX, TrajectoryFile
-from persist_cli.io.files import file_sha256
+from persist_cli.data.parquet import SUFFIX
+from persist_cli.data.store import TrajectoryFile
 
 LISTS = ("seen_before", "first_visits", "counted")  # values of a case, one for each frame
 
@@ -109,7 +109,7 @@ def hash_trajectories(cases: Sequence[Case]) -> list[dict[str, Any]]:
     for case in cases:
         hashes = hashes_by_folder.setdefault(case.data, {})
         if case.trajectory not in hashes:
-            hashes[case.trajectory] = file_sha256(case.file.path)
+            hashes[case.trajectory] = case.file.sha256
     return [{"path": path, "trajectories": dict(sorted(hashes.items()))} for path, hashes in hashes_by_folder.items()]
 
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from persist_cli.api.checkpoint import PLAIN, reference_checkpoint
-from persist_cli.data.reference import data_folder
+from persist_cli.data.mirror import address_of
 from persist_cli.errors import PersistError
 from persist_cli.evaluate.aggregate import Table, row_results
 from persist_cli.evaluate.cases import Case, cases_json, counts
@@ -60,7 +59,6 @@ def run_eval(paths: Sequence[Path], plan: EvalPlan, out: Path, report: Path | No
             check_folder(folder)
     processes = Processes()
     with exclusive(out, processes.main):
-        plan = replace(plan, data=tuple(data_folder(str(folder)) for folder in plan.data))
         run, loader = prepare(paths or [reference_checkpoint()], plan, out, processes)
         measure_rows(run, loader, processes)
         if not processes.main:
@@ -99,7 +97,7 @@ def results_json(run: Evaluation, processes: int) -> dict[str, Any]:
                 "counted_frames": counted,
                 "predicted_frames": predicted,
             },
-            "data": [data | {"splits": splits_of(run.cases, data["path"])} for data in run.journal.data()],
+            "data": [data_json(data, run.cases) for data in run.journal.data()],
             "image_size": [info.height, info.width],
             "clips": cases_json(run.cases),
             "metrics": metric_json(run.metrics),
@@ -140,6 +138,12 @@ def windows_json(run: Evaluation) -> dict[str, list[tuple[int, int]]]:
     frames = run.cases[0].frames
     bounds = {metric: window_bounds(frames) for metric in SHOWN if metric in run.metrics}
     return bounds | {CELLS: window_bounds(frames, run.predicted_at_once)}
+
+
+def data_json(data: dict[str, Any], cases: Sequence[Case]) -> dict[str, Any]:
+    """A data set of the journal with the splits of its trajectories, and its address where the folder mirrors one."""
+    address = address_of(Path(data["path"]))
+    return data | ({"address": address} if address else {}) | {"splits": splits_of(cases, data["path"])}
 
 
 def splits_of(cases: Sequence[Case], folder: str) -> dict[str, str]:

@@ -11,7 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from persist_cli.data.store import SUFFIX
+from persist_cli.data.mirror import fetched
+from persist_cli.data.parquet import SUFFIX
 from persist_cli.errors import DataError
 from persist_cli.evaluate.cases import Case, hash_trajectories
 from persist_cli.io.begun_with import check_same
@@ -106,7 +107,7 @@ class Journal:
         for folder in self.data():
             for name, digest in folder["trajectories"].items():
                 path = Path(folder["path"]) / f"{name}{SUFFIX}"
-                if not path.is_file() or file_sha256(path) != digest:
+                if not fetched(path).is_file() or file_sha256(path) != digest:
                     raise DataError(
                         f"{path}: not what it was when the evaluation in {self.folder.parent} began; choose another "
                         "--out or delete that one"

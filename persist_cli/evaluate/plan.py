@@ -16,6 +16,7 @@ from persist_cli.checkpoints.contamination import ALLOW, OTHER_DATA, scenes_to_a
 from persist_cli.checkpoints.lineage import training_scenes
 from persist_cli.checkpoints.placement import check_placement
 from persist_cli.data.cameras import unfamiliar_view
+from persist_cli.data.reference import data_folder
 from persist_cli.errors import PersistError, hint
 from persist_cli.evaluate.backbones import BackboneLoader, check_bases, common_sampling
 from persist_cli.evaluate.cases import Case
@@ -54,7 +55,7 @@ class EvalPlan:
     ``controls_named`` says whether the user named the controls: one that cannot be made is an error only then.
     """
 
-    data: tuple[Path, ...]
+    data: tuple[str, ...]
     protocol: str
     memories: tuple[str, ...] | None  # ``None`` for those of ``default_memories``
     controls: tuple[str, ...]
@@ -73,10 +74,14 @@ class EvalPlan:
     new_poses: NewPoses = NEW_POSES
     allow_training_scenes: bool = False
 
+    @property
+    def folders(self) -> tuple[Path, ...]:
+        """The folders of the data sets, each once."""
+        return tuple({folder.resolve(): folder for folder in map(data_folder, self.data)}.values())
+
     def without_repeats(self) -> EvalPlan:
         """This plan without repeated names, because a memory named twice would be two rows of one name."""
-        data = {folder.resolve(): folder for folder in self.data}
-        return replace(self, data=tuple(data.values()), memories=tuple(dict.fromkeys(self.memories or ())))
+        return replace(self, memories=tuple(dict.fromkeys(self.memories or ())))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,7 +158,7 @@ def prepare(
     check_choices(plan)
     protocol, metrics = PROTOCOLS[plan.protocol], choose_metrics(plan.metrics, METRICS)
     with busy("loading the models"):
-        bases = check_bases(checkpoints, plan.data, [sampling, *config.sampling_of.values()], loader)
+        bases = check_bases(checkpoints, plan.folders, [sampling, *config.sampling_of.values()], loader)
     models = build_model_rows(checkpoints, config, protocol)  # unknown memories are reported before clips are sought
     search = clip_search(plan, checkpoints, bases.frames_per_clip - 1)
     journal = Journal(out)
@@ -190,7 +195,7 @@ def prepare(
 def clip_search(plan: EvalPlan, checkpoints: Sequence[Checkpoint], predicted_at_once: int) -> ClipSearch:
     """Where and how long the clips of an evaluation are looked for, of models that predict some frames at once."""
     return ClipSearch(
-        folders=plan.data, frames=plan.frames, limit=plan.clips, predicted_at_once=predicted_at_once,
+        folders=plan.folders, frames=plan.frames, limit=plan.clips, predicted_at_once=predicted_at_once,
         training_scenes=scenes_to_avoid(checkpoints), new_poses=plan.new_poses,
     )  # fmt: skip
 
@@ -259,7 +264,7 @@ def identity(
     plan: EvalPlan, sampling: Sampling, checkpoints: Sequence[Checkpoint], metrics: Mapping[str, Metric]
 ) -> dict[str, Any]:
     """JSON values of all that changes a figure, but for the data: an evaluation with equal values goes on."""
-    options = asdict(plan) | {"data": [str(folder.resolve()) for folder in plan.data]}
+    options = asdict(plan) | {"data": [str(folder.resolve()) for folder in plan.folders]}
     options |= {"sampling": asdict(sampling) | plan.placement.changes()}
     for name in ("placement", "controls_named", "resample", "training_seeds", "allow_training_scenes"):
         del options[name]  # what is left of them changes no measured figure

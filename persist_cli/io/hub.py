@@ -1,4 +1,4 @@
-"""Weights of others: whether the Hugging Face hub is in reach, where fetched weights are kept, and quiet loading."""
+"""Weights of others: whether the Hugging Face hub is in reach, where what is fetched is kept, and quiet loading."""
 
 from __future__ import annotations
 
@@ -63,19 +63,26 @@ def without_bars() -> Iterator[None]:
             transformers_logging.enable_progress_bar()
 
 
-def weights_home() -> Path:
-    """The folder of all fetched weights: ``$PERSIST_CACHE/weights``, else a folder in the user's cache.
+def cache_home() -> Path:
+    """The folder of all that is fetched: ``$PERSIST_CACHE``, else a folder in the user's cache.
 
     Raises:
         PersistError: when the user has no home folder, as a user of a container without a name.
     """
     cache = os.environ.get("PERSIST_CACHE")
     if cache:
-        return Path(cache) / "weights"
+        return Path(cache)
     try:
-        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "persist" / "weights"
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "persist"
     except RuntimeError as error:
-        raise PersistError("this user has no home folder to keep weights in; set PERSIST_CACHE to a folder") from error
+        raise PersistError(
+            "this user has no home folder to keep weights and data in; set PERSIST_CACHE to a folder"
+        ) from error
+
+
+def weights_home() -> Path:
+    """The folder of all fetched weights; errors as those of ``cache_home``."""
+    return cache_home() / "weights"
 
 
 def cached_weight(name: str) -> Path | None:

@@ -373,7 +373,7 @@ def train(learning: Learning, number: int) -> None:
     file = learning.folder(number) / "policy.yaml"
     if not file.is_file():
         write_text(file, yaml.safe_dump(recipe, sort_keys=False))
-    data = [learning.folder(one) / "walks" for one in range(1, number + 1)]
+    data = [str(learning.folder(one) / "walks") for one in range(1, number + 1)]
     run_finetune(FinetunePlan(recipe=str(file), overrides=plan.training, data=data, out=run, resume=True))
 
 

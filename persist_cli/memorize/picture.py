@@ -16,7 +16,8 @@ from persist_cli.api.ground import Body
 from persist_cli.api.observations import Frame, TrajectoryInfo
 from persist_cli.data.images import FORMATS, crop_resize
 from persist_cli.data.importers.readers import read_photo
-from persist_cli.data.store import SUFFIX, Store, write_trajectory
+from persist_cli.data.parquet import SUFFIX
+from persist_cli.data.store import Store, write_trajectory
 from persist_cli.errors import DataError
 from persist_cli.memorize.depth_model import estimate_depth
 

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from persist_cli.api.actions import FREE, Action, ActionVocabulary
 from persist_cli.api.observations import Frame, Observations, TrajectoryInfo
-from persist_cli.data.store import SUFFIX, write_trajectory
+from persist_cli.data.parquet import SUFFIX
+from persist_cli.data.store import write_trajectory
 from persist_cli.errors import PersistError
 from persist_cli.io.files import check_folder
 from persist_cli.navigation.ground_mapper import body_of, tells_body

@@ -24,8 +24,8 @@ from persist_cli.api.scene import Scene
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.checkpoints.scene_models import find_scene_model
 from persist_cli.data.clips import ClipDataset, ClipFrames, ClipSample
+from persist_cli.data.store import TrajectoryFile
 from persist_cli.data.writing_noise import WritingNoise
-from persist_cli.io.files import file_sha256
 from persist_cli.memorize.factory import MemoryFactory, with_memory
 from persist_cli.memorize.kept_features import KeptFeatures
 from persist_cli.memorize.sources import Source
@@ -103,7 +103,7 @@ class CacheKeys:
 
     def of_clip(self, frames: ClipFrames) -> ClipKeys:
         """The keys of a clip."""
-        clip: dict[str, Any] = {"trajectory": self.file_hash(frames.file.path), "frames": list(frames.frames)}
+        clip: dict[str, Any] = {"trajectory": self.file_hash(frames.file), "frames": list(frames.frames)}
         if frames.view is not None:
             clip["view"] = frames.view.to_json()
         latents = tokens = memory = None
@@ -119,11 +119,11 @@ class CacheKeys:
             memory = cache_key(clip | {"frames": "memory"} | context | self.tokens)
         return ClipKeys(latents, tokens, memory)
 
-    def file_hash(self, path: Path) -> str:
+    def file_hash(self, file: TrajectoryFile) -> str:
         """The SHA-256 of a trajectory's file."""
-        if path not in self.hashes:
-            self.hashes[path] = file_sha256(path)
-        return self.hashes[path]
+        if file.path not in self.hashes:
+            self.hashes[file.path] = file.sha256
+        return self.hashes[file.path]
 
 
 @dataclass(frozen=True)
@@ -281,7 +281,7 @@ class ClipEncoder:
     def bring_features(self, frames: ClipFrames) -> None:
         """Let a costly encoder know the features of a clip's trajectory, where the cache keeps them."""
         if self.cache is not None and self.cache.features is not None and frames.view is None:
-            self.cache.features.bring(frames.file, self.cache.keys.file_hash(frames.file.path))
+            self.cache.features.bring(frames.file, self.cache.keys.file_hash(frames.file))
 
     def _new_latents(self, clip: Clip, frames: ClipFrames) -> ClipLatents:
         if self.cache is None or self.cache.cache.full:  # a whole trajectory would be encoded again for each clip

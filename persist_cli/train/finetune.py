@@ -115,7 +115,7 @@ class FinetunePlan:
 
     recipe: str
     overrides: Sequence[str] = ()
-    data: Sequence[Path] = ()
+    data: Sequence[str] = ()
     out: Path | None = None
     resume: bool = False
     cache: CacheSettings | None = None
@@ -126,7 +126,7 @@ def run_finetune(plan: FinetunePlan) -> None:
     """Train a stage and leave a run folder; see ``persist finetune --help``."""
     values = apply_overrides(read_recipe(plan.recipe), plan.overrides)
     if plan.data:
-        values = apply_overrides(values, [f"data.path={json.dumps([str(folder) for folder in plan.data])}"])
+        values = apply_overrides(values, [f"data.path={json.dumps([*plan.data])}"])
     run = plan.out or Path("runs") / Path(plan.recipe).stem
     begun = run if plan.resume and step_folders(run) and not values.get("distill") else None
     recipe = make_recipe(with_scene_paths(with_adapter(values, begun)), plan.recipe)

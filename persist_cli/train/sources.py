@@ -90,7 +90,7 @@ def write_hashes(recipe: Recipe, run: Path) -> None:
 def data_files(recipe: Recipe) -> list[list[list[Any]]]:
     """Name and bytes of each trajectory of a recipe's data sets, as JSON values."""
     folders = [data_folder(path) for path in recipe.data.path]
-    return [[[file.path.name, file.path.stat().st_size] for file in Store(folder)] for folder in folders]
+    return [[[file.path.name, file.file_size] for file in Store(folder)] for folder in folders]
 
 
 def has_same_data(recipe: Recipe, run: Path) -> bool:

@@ -252,5 +252,5 @@ def test_without_a_home_folder_no_weights_are_here_and_a_line_says_what_to_set(d
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(os.path, "expanduser", lambda path: path)  # as where the system knows no such user
     assert cached_weight(NAME) is None
-    with pytest.raises(PersistError, match="no home folder to keep weights in; set PERSIST_CACHE"):
+    with pytest.raises(PersistError, match="no home folder to keep weights and data in; set PERSIST_CACHE"):
         fetch_weight(weight_of(NAME, original(NAME), directory), directory, offline=True)

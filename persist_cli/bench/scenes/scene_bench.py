@@ -35,10 +35,9 @@ from persist_cli.bench.scenes.training_houses import House, read_houses
 from persist_cli.bench.scenes.views import Region, View, near_camera, same_form, true_region
 from persist_cli.checkpoints.contamination import ALLOW, OTHER_DATA, ShownScene, known_names, refuse_training_scenes
 from persist_cli.checkpoints.scene_models import TrainedSceneModel, find_scene_model
-from persist_cli.data.reference import parse_reference
+from persist_cli.data.reference import data_folder, parse_reference
 from persist_cli.data.store import Store, TrajectoryFile
 from persist_cli.errors import DataError, PersistError, hint
-from persist_cli.io.files import file_sha256
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.memorize.memory_config import plugin_settings, scene_config
 from persist_cli.navigation.ground_mapper import body_of
@@ -98,7 +97,7 @@ class SceneBenchPlan:
 
     model: str | None
     data: str
-    train: Path | None
+    train: str | None
     parts: tuple[str, ...]
     images: int = 32
     seeds: int = 3
@@ -253,7 +252,7 @@ def read_view(file: TrajectoryFile, frame: int, radius: float, scenes: Scenes) -
     region = Region.around(cells, image.cameras.world_from_camera[0], radius)
     truth = true_region(cells, region)
     near = near_camera(truth, image.cameras.centers[0], radius)
-    name, sha256 = f"{file.name}:{frame}", file_sha256(file.path)
+    name, sha256 = f"{file.name}:{frame}", file.sha256
     view = View(
         name=name, scene=file.info.scene, info=file.info, frame=image, region=region, known=truth, truth=truth,
         near=near, house=cells, sha256=sha256,
@@ -271,7 +270,7 @@ def training_houses(plan: SceneBenchPlan, views: Sequence[View]) -> list[House]:
     if plan.train is None or "completion" not in plan.parts:
         return []
     measured = {view.scene for view in views}
-    store = Store(plan.train)
+    store = Store(data_folder(plan.train))
     both = sorted({file.info.scene for file in store} & measured)
     if both:
         raise DataError(

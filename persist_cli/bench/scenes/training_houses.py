@@ -13,7 +13,6 @@ from torch import Tensor
 from persist_cli.api.cells import CellForm, CellGrid, is_solid
 from persist_cli.bench.scenes.views import Region, View, same_form, true_region
 from persist_cli.data.store import Store, TrajectoryFile
-from persist_cli.io.files import file_sha256
 from persist_cli.output.console import add_task, progress
 
 AT_ONCE = 16  # views that are compared with a house together
@@ -79,7 +78,7 @@ def read_houses(store: Store, most: int, form: CellForm) -> list[House]:
             file = files[number]
             spread = np.unique(np.linspace(0, len(file) - 1, POSES).round().astype(int))
             cells = same_form(file.cells(0), form, str(file.path))
-            houses.append(House(file.info.scene, cells, file.poses()[spread], file_sha256(file.path)))
+            houses.append(House(file.info.scene, cells, file.poses()[spread], file.sha256))
             bar.advance(task)
     return houses
 

@@ -15,7 +15,8 @@ from persist_cli.data.held_out import HELD_OUT_FROM, ONLY_BEFORE
 from persist_cli.data.images import CropResize, crop_resize
 from persist_cli.data.importers.checking import checked_trajectories
 from persist_cli.data.importers.gravity import FROM_CAMERAS, GIVEN, Direction, up_text
-from persist_cli.data.store import SUFFIX, TrajectoryFile, write_trajectory
+from persist_cli.data.parquet import SUFFIX
+from persist_cli.data.store import TrajectoryFile, write_trajectory
 from persist_cli.data.store_header import schema
 from persist_cli.errors import DataError
 from persist_cli.io.command_line import quoted

@@ -59,9 +59,13 @@ class ProtocolRecord(ResultModel):
 
 
 class DataSet(ResultModel):
-    """A data set with the hash of each trajectory that was used, and the split that each is of, where it says so."""
+    """A data set with the hash of each trajectory that was used, and the split that each is of, where it says so.
+
+    ``address`` is what the folder mirrors, ``None`` where it is no mirror.
+    """
 
     path: str
+    address: str | None = None
     trajectories: dict[str, str]
     splits: dict[str, str] = {}
 
