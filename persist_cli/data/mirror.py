@@ -39,7 +39,7 @@ MAGIC: Final = b"PAR1"  # begins and ends a Parquet file
 FOOTER: Final = 8  # bytes behind a header: its length, and ``MAGIC``
 
 AT_ONCE: Final = 16  # files that are asked for at once
-WAITS: Final = (1.0, 4.0)  # seconds before each new try
+WAITS: Final = (1.0, 4.0)  # seconds before each new try of a web server; other clients try anew themselves
 
 FULL: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # the disk is full, or the file too large for it
 
@@ -133,7 +133,7 @@ def fetched(path: Path) -> Path:
         system, _ = _file_system(str(address_of(path.parent)))
         try:
             with written_aside(path) as aside:
-                _tried(lambda: system.get_file(file.place, str(aside)))
+                _tried(file.place, lambda: system.get_file(file.place, str(aside)))
                 if aside.stat().st_size != file.size:
                     raise DataError(
                         f"{file.place}: {aside.stat().st_size} bytes came, {file.size} were listed; try again"
@@ -182,14 +182,16 @@ def _list(address: str) -> dict[str, RemoteFile]:
     """The trajectories at an address by their names here."""
     with _address_errors(address):
         system, place = _file_system(address)
-        entries = _tried(lambda: system.ls(place, detail=True))
+        entries = _tried(place, lambda: system.ls(place, detail=True))
         named = {_name(entry["name"], address): entry for entry in entries if entry["type"] == "file"}
         wanted = {name: named[name] for name in sorted(filter(None, named))}
         if not wanted:
             raise DataError(f"{address}: no trajectory in it (*{SUFFIX})")
         with ThreadPoolExecutor(AT_ONCE) as threads:  # a web server's list has names only
             infos = threads.map(
-                lambda entry: entry if entry.get("size") is not None else _tried(lambda: system.info(entry["name"])),
+                lambda entry: (
+                    entry if entry.get("size") is not None else _tried(place, lambda: system.info(entry["name"]))
+                ),
                 wanted.values(),
             )
             return {name: _remote_file(info, address) for name, info in zip(wanted, infos, strict=True)}
@@ -232,7 +234,7 @@ def _bring_header(system: Any, path: Path, file: RemoteFile) -> None:
         wanted = END
         while True:
             start = max(file.size - wanted, 0)
-            end = _tried(functools.partial(system.cat_file, file.place, start=start, end=file.size))
+            end = _tried(file.place, functools.partial(system.cat_file, file.place, start=start, end=file.size))
             needed = int.from_bytes(end[-FOOTER:][:4], "little") + FOOTER
             if needed <= len(end) or needed > file.size or len(end) != file.size - start:
                 break
@@ -259,9 +261,9 @@ def _file_system(address: str) -> tuple[Any, str]:
     return system, str(place)
 
 
-def _tried(work: Callable[[], Result]) -> Result:
-    """What a work on a server returns, which is tried anew when the connection fails."""
-    for wait in WAITS:
+def _tried(place: str, work: Callable[[], Result]) -> Result:
+    """What a work on the server of a place returns; it is tried anew where a connection to a web server fails."""
+    for wait in WAITS if place.startswith("http") else ():
         try:
             return work()
         except (FileNotFoundError, PermissionError, NotImplementedError):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,7 +21,7 @@ from persist_cli.data.reference import data_folder, parse_reference
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError
 from persist_cli.io.files import ASIDE
-from tests.support.data_server import DataServer, serving
+from tests.support.data_server import REPOSITORY, DataServer, serving
 from tests.support.disk import file_limit
 from tests.support.micro_runs import equal_runs, stage
 
@@ -172,6 +174,20 @@ def test_other_file_systems_of_fsspec_are_read_in_the_same_way(houses: Path) -> 
         assert [file.sha256 for file in store] == [file.sha256 for file in Store(houses)]
     finally:
         memory.rm("/bucket", recursive=True)
+
+
+def test_the_client_of_the_hub_is_asked_for_its_addresses(server: DataServer, houses: Path, cache: Path) -> None:
+    read = (
+        "from persist_cli.data.reference import data_folder; from persist_cli.data.store import Store;"
+        f"store = Store(data_folder('hf://datasets/{REPOSITORY}/houses'));"
+        "print([file.length for file in store], store[1].sha256)"
+    )
+    hub = {"HF_ENDPOINT": server.address.removesuffix("/houses"), "HF_HUB_OFFLINE": "0", "PERSIST_CACHE": str(cache)}
+    said = subprocess.run(
+        [sys.executable, "-c", read], env=os.environ | hub, capture_output=True, text=True, check=True
+    )
+    assert said.stdout == f"[24, 24] {Store(houses)[1].sha256}\n"
+    assert server.whole() == names(next((cache / "data").iterdir())) == ["walk-1.parquet"]
 
 
 @pytest.mark.parametrize(

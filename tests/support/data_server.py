@@ -1,8 +1,9 @@
-"""A web server of this machine that lists and sends the files of a folder, and can fail."""
+"""A web server that lists and sends the files of a folder, also as the Hugging Face hub does, and can fail."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import re
 import threading
 from collections.abc import Iterator
@@ -11,6 +12,10 @@ from http import HTTPStatus
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
+
+REPOSITORY = "owner/name"  # that the folder is of, where the hub's client asks
+API = f"/api/datasets/{REPOSITORY}"
+FILES = f"/datasets/{REPOSITORY}/resolve/main/houses"
 
 
 class DataServer(ThreadingHTTPServer):
@@ -39,18 +44,24 @@ class DataServer(ThreadingHTTPServer):
 
 
 class Handler(SimpleHTTPRequestHandler):
-    """Sends whole files, parts of them, and lists of them."""
+    """Sends whole files, parts of them, and lists of them; and what the hub's client asks for."""
 
     server: DataServer
 
     def translate_path(self, path: str) -> str:
         """The file of an address, whose first part is the name of the folder."""
-        return super().translate_path(path.removeprefix("/houses"))
+        return super().translate_path(path.removeprefix(FILES).removeprefix("/houses"))
 
     def do_GET(self) -> None:
         """Send what is asked for."""
-        if not self.fails():
-            self.send_part() if self.server.ranges and "Range" in self.headers else super().do_GET()
+        if self.fails():
+            return
+        if self.path.startswith(API):
+            self.send_answer()
+        elif self.server.ranges and "Range" in self.headers:
+            self.send_part()
+        else:
+            super().do_GET()
 
     def do_HEAD(self) -> None:
         """Send how long a file is."""
@@ -72,6 +83,22 @@ class Handler(SimpleHTTPRequestHandler):
         assert found is not None
         data = Path(self.translate_path(self.path)).read_bytes()[int(found[1]) : int(found[2]) + 1]
         self.send_response(HTTPStatus.PARTIAL_CONTENT)
+        self.send_header("Content-Length", str(len(data)))
+        self.end_headers()
+        self.wfile.write(data)
+
+    def send_answer(self) -> None:
+        """Say what is in the repository, or that it is there."""
+        answer: Any = {"id": REPOSITORY, "sha": "b" * 40, "private": False, "downloads": 0, "likes": 0, "tags": []}
+        if self.path.startswith(f"{API}/tree/"):
+            files = sorted(Path(self.translate_path("/houses/")).glob("*.parquet"))
+            answer = [
+                {"type": "file", "path": f"houses/{file.name}", "size": file.stat().st_size, "oid": "a" * 40}
+                for file in files
+            ]
+        data = json.dumps(answer).encode()
+        self.send_response(HTTPStatus.OK)
+        self.send_header("Content-Type", "application/json")
         self.send_header("Content-Length", str(len(data)))
         self.end_headers()
         self.wfile.write(data)
