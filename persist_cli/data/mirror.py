@@ -188,13 +188,16 @@ def _list(address: str) -> dict[str, RemoteFile]:
         if not wanted:
             raise DataError(f"{address}: no trajectory in it (*{SUFFIX})")
         with ThreadPoolExecutor(AT_ONCE) as threads:  # a web server's list has names only
-            infos = threads.map(
-                lambda entry: (
-                    entry if entry.get("size") is not None else _tried(place, lambda: system.info(entry["name"]))
-                ),
-                wanted.values(),
-            )
+            infos = threads.map(functools.partial(_info, system), wanted.values())
             return {name: _remote_file(info, address) for name, info in zip(wanted, infos, strict=True)}
+
+
+def _info(system: Any, entry: dict[str, Any]) -> dict[str, Any]:
+    """What a file system says of a file, with its size."""
+    if entry.get("size") is not None:
+        return entry
+    info: dict[str, Any] = _tried(entry["name"], lambda: system.info(entry["name"]))
+    return info
 
 
 def _name(place: str, address: str) -> str | None:
