@@ -46,8 +46,8 @@ class Importer(ABC):
         self.settings = self.settings_type() if settings is None else settings
 
     @abstractmethod
-    def trajectories(self, source: Path) -> Iterator[ForeignTrajectory]:
-        """Yield every trajectory under the file or folder ``source``.
+    def trajectories(self, source: Path) -> Iterator[ForeignTrajectory | DataError]:
+        """Yield every trajectory under the file or folder ``source``; for one that cannot be used, why.
 
         Raises:
             DataError: when what all frames share is missing or wrong; the message names the file.

@@ -99,7 +99,7 @@ StoredTurnOption = Annotated[
 ]
 
 SkipBadOption = Annotated[
-    bool, typer.Option("--skip-bad", help="Leave out frames whose pose or images cannot be used, and count them.")
+    bool, typer.Option("--skip-bad", help="Leave out frames that cannot be used, and recordings without others.")
 ]
 
 HoldOutOption = Annotated[

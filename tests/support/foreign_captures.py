@@ -9,10 +9,22 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from persist_cli.api.importer import ForeignTrajectory, Importer
+from persist_cli.errors import DataError
 from tests.support.rooms import Room, walk
 
 ROOM = Room()
 FROM_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # the room's y is the format's z
+
+
+def usable(importer: Importer, source: Path) -> list[ForeignTrajectory]:
+    """All trajectories of a source, whose images are not read yet; the error of the first one that cannot be used."""
+    found = []
+    for trajectory in importer.trajectories(source):
+        if isinstance(trajectory, DataError):
+            raise trajectory
+        found.append(trajectory)
+    return found
 
 
 def poses(frames: int) -> np.ndarray:

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from persist_cli.api.importer import ForeignTrajectory
 from persist_cli.data.importers.lerobot import LeRobot
 from persist_cli.data.importers.lerobot_info import LeRobotSettings
-from tests.support.foreign_captures import FROM_Y_UP
+from tests.support.foreign_captures import FROM_Y_UP, usable
 from tests.support.phone_captures import write_lossless
 from tests.support.rooms import Room, look, walk
 
@@ -39,7 +39,7 @@ ROBOT = replace(POSE, axes="robot", mount=(0.0, 0.0, HEIGHT, PITCH))
 
 def read_all(source: Path, settings: LeRobotSettings = POSE) -> list[ForeignTrajectory]:
     """All episodes, whose images are not read yet."""
-    return list(LeRobot(settings).trajectories(source))
+    return usable(LeRobot(settings), source)
 
 
 def write_lerobot(

@@ -6,7 +6,7 @@ import contextlib
 import hashlib
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -176,6 +176,19 @@ class Capture:
         """A short hash of the names and sizes of all files."""
         text = "\n".join(f"{path.name} {path.stat().st_size}" for path in self.files if path.is_file())
         return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def each_or_cause(
+    places: Iterable[Path], read: Callable[[Path], ForeignTrajectory]
+) -> Iterator[ForeignTrajectory | DataError]:
+    """Yield what is read of each place; where that cannot be used, why."""
+    for place in places:
+        try:
+            trajectory = read(place)
+        except DataError as error:
+            yield error
+        else:
+            yield trajectory
 
 
 def folders_with(marker: str, source: Path, wanted: str) -> list[Path]:

@@ -23,23 +23,27 @@ FIT_NAME = (
 )
 
 
-def checked_trajectories(importer: Importer, source: Path) -> Iterator[ForeignTrajectory]:
-    """Yield every trajectory of ``source``; its frames are checked and counted as they are read.
+def checked_trajectories(importer: Importer, source: Path) -> Iterator[ForeignTrajectory | DataError]:
+    """Yield every trajectory of ``source``, or why it cannot be used; frames are checked and counted as they are read.
 
     Raises:
         PluginError: naming the importer, when it yields anything else than it promises, or two trajectories of one
             name.
         DataError: when it finds no trajectory, and whatever the importer says of its source.
     """
-    trajectories, names = importer.trajectories(source), set[str]()
+    trajectories, names, found = importer.trajectories(source), set[str](), False
     with faults_of("importer", importer.name):
         _check_iterable(trajectories, "trajectories() returned")
     for trajectory in trajectories:
+        found = True
+        if isinstance(trajectory, DataError):
+            yield trajectory
+            continue
         with faults_of("importer", importer.name):
             _check_trajectory(trajectory, names)
         names.add(trajectory.name)
         yield replace(trajectory, frames=_checked_frames(importer, trajectory))
-    if not names:
+    if not found:
         raise DataError(f"{source}: {find_plugin('importer', importer.name)} finds no trajectory there")
 
 
@@ -51,7 +55,7 @@ def is_fit_name(name: str) -> bool:
 def _check_trajectory(trajectory: Any, names: set[str]) -> None:
     """Raise ``DataError`` unless something is a trajectory, of none of the names that were given before."""
     if not isinstance(trajectory, ForeignTrajectory):
-        raise DataError(f"it yields {shown(trajectory)}, no ForeignTrajectory")
+        raise DataError(f"it yields {shown(trajectory)}, neither a ForeignTrajectory nor a DataError")
     name, where = trajectory.name, f"trajectory {shown(trajectory.name)}"
     if not isinstance(name, str) or not is_fit_name(name):
         raise DataError(f"it names a trajectory {shown(name)}; {FIT_NAME}")

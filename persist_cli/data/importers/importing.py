@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -28,6 +29,10 @@ MOST_CAUSES = 3  # that are printed for a trajectory
 ABANDONED = 600.0  # seconds without a change after which what an import wrote is no longer being written
 
 
+class NothingUsableError(DataError):
+    """None of the frames of a trajectory can be used."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class ImportPlan:
     """Changes made to every trajectory while it is imported.
@@ -37,7 +42,7 @@ class ImportPlan:
         every: keep every n-th frame.
         step: metres of a step of walking actions to add, ``None`` for the usual one, or for no such actions.
         turn: degrees of a turn of walking actions to add, as ``step``.
-        skip_bad: leave out frames that cannot be used.
+        skip_bad: leave out frames that cannot be used, and trajectories without any other.
         hold_out: share of the frames at the end of each trajectory that are kept for tests; 0 for none.
         part: ``train`` for the frames before those, ``test`` for all, of which those at the end are held out.
         up: unit vector that points up in the world, ``None`` for the one of the importer.
@@ -105,7 +110,7 @@ class ImportPlan:
             left_out: gets the cause of each bad frame that is left out.
 
         Raises:
-            DataError: for a bad frame, unless bad frames are left out; and when all are.
+            DataError: for a bad frame, unless bad frames are left out; ``NothingUsableError`` when all are.
         """
         crop = self._crop(trajectory.info) if self.size else None
         most = self.written(trajectory)
@@ -126,7 +131,7 @@ class ImportPlan:
                 yield replace(last, action=FREE if gap or self.every > 1 else last.action)
             last, gap = crop.frame(frame) if crop else frame, False
         if last is None and left_out:
-            raise DataError(f"{trajectory.name}: none of its frames can be used; {left_out[0]}")
+            raise NothingUsableError(f"{trajectory.name}: none of its frames can be used; {left_out[0]}")
         if last is not None:
             yield replace(last, action=None)
 
@@ -134,7 +139,7 @@ class ImportPlan:
         """Read the trajectory's frames, and return how many of those that are looked at can be used.
 
         Raises:
-            DataError: when no frame can be used.
+            NothingUsableError: when no frame can be used.
         """
         causes: list[DataError] = []
         with progress() as bar:
@@ -144,7 +149,7 @@ class ImportPlan:
                 bar.advance(task)
         usable = self.chosen(trajectory) - len(causes)
         if not usable:
-            raise DataError(f"{trajectory.name}: none of its frames can be used; {causes[0]}")
+            raise NothingUsableError(f"{trajectory.name}: none of its frames can be used; {causes[0]}")
         return usable
 
     def chosen(self, trajectory: ForeignTrajectory) -> int:
@@ -197,17 +202,7 @@ def run_import(
         raise DataError(f"{source}: no such file or folder")
     if not 0 <= plan.hold_out < 1:
         raise DataError(f"--hold-out {plan.hold_out:g}: give a share of the frames, 0 or more and below 1, as in 0.3")
-    usable: dict[str, int] = {}
-    if plan.hold_out and plan.skip_bad:  # the share that is held out is one of the usable frames
-        usable = {one.name: plan.count_usable(one) for one in checked_trajectories(importer, source)}
-    written = [
-        [
-            import_trajectory(importer, trajectory, replace(part, usable=usable.get(trajectory.name)), folder)
-            for trajectory in checked_trajectories(importer, source)
-        ]
-        for part, folder in plan.parts(out)
-    ]
-    rows = [row for part in reversed(written) for row in part]
+    rows, left_out = import_trajectories(importer, source, out, plan)
     unsure = [row["name"] for row in rows if row["world_up_is"].startswith(FROM_CAMERAS)]
     if unsure:
         warn(
@@ -215,7 +210,7 @@ def run_import(
             "if it is wrong, give --up X,Y,Z and a new --out"
         )
     if json:
-        print_json({"out": str(out), "trajectories": rows})
+        print_json({"out": str(out), "trajectories": rows, "left_out": left_out})
         return
     columns = ("trajectory", "frames", "left out", "size", "up", "state")
     print_table(str(out), columns, [_cells(row) for row in rows])
@@ -223,7 +218,63 @@ def run_import(
         if row["causes"]:
             rest = row["left_out"] - len(row["causes"])
             say(f"left out of {row['name']}: {'; '.join(row['causes'])}{f'; and {rest} more' if rest else ''}")
+    for cause in left_out:
+        say(f"left out: {cause}")
     say(f"next: persist inspect {quoted(plan.parts(out)[0][1])}")
+
+
+def import_trajectories(
+    importer: Importer, source: Path, out: Path, plan: ImportPlan
+) -> tuple[list[dict[str, Any]], list[str]]:
+    """Import every trajectory of ``source`` that is not yet in ``out``.
+
+    Returns:
+        What the table says of each, and why others were left out.
+
+    Raises:
+        DataError: for what cannot be used, unless that is left out; and when all trajectories are.
+    """
+    causes: dict[str, None] = {}  # each once, though the source is read for each part
+    usable: dict[str, int] = {}
+    if plan.hold_out and plan.skip_bad:  # the share that is held out is one of the usable frames
+        for trajectory in _whole(importer, source, plan, causes):
+            with _left_out(plan, causes):
+                usable[trajectory.name] = plan.count_usable(trajectory)
+    written: list[list[dict[str, Any]]] = []
+    for part, folder in plan.parts(out):
+        written.append([])
+        for trajectory in _whole(importer, source, plan, causes):
+            if usable and trajectory.name not in usable:
+                continue
+            with _left_out(plan, causes):
+                part_of_it = replace(part, usable=usable.get(trajectory.name))
+                written[-1].append(import_trajectory(importer, trajectory, part_of_it, folder))
+    rows = [row for part in reversed(written) for row in part]
+    if not rows:
+        raise DataError(f"nothing of {source} can be used; {next(iter(causes))}")
+    return rows, list(causes)
+
+
+def _whole(importer: Importer, source: Path, plan: ImportPlan, causes: dict[str, None]) -> Iterator[ForeignTrajectory]:
+    """Yield the trajectories that can be used; why others cannot gets into ``causes``, or is raised."""
+    several = False
+    for trajectory in checked_trajectories(importer, source):
+        if not isinstance(trajectory, DataError):
+            yield trajectory
+        elif plan.skip_bad:
+            causes[str(trajectory)] = None
+        else:
+            raise DataError(f"{trajectory}{'; --skip-bad leaves such trajectories out' * several}") from trajectory
+        several = True
+
+
+@contextlib.contextmanager
+def _left_out(plan: ImportPlan, causes: dict[str, None]) -> Iterator[None]:
+    """Within the block a trajectory of which nothing can be used is left out; ``causes`` gets why."""
+    try:
+        yield
+    except NothingUsableError as error:
+        causes[str(error)] = None
 
 
 def _cells(row: dict[str, Any]) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
@@ -43,22 +43,31 @@ class LeRobot(Importer):
     settings_type = LeRobotSettings
     settings: LeRobotSettings
 
-    def trajectories(self, source: Path) -> Iterator[ForeignTrajectory]:
+    def trajectories(self, source: Path) -> Iterator[ForeignTrajectory | DataError]:
         """Read every episode of every dataset of ``source``.
 
         Raises:
             DataError: when there is none, the settings name what it does not have, or a file is missing or damaged.
         """
         for folder in folders_with(META, source, f"{META}/{INFO} in it nor folders with one"):
-            captures = Dataset(folder, self.settings).captures()
-            if self.settings.axes == ROBOT:
-                yield from (capture.trajectory(UP_OF_ROBOTS) for capture in captures)
-            elif self.settings.scene == "episode":
-                yield from (capture.trajectory(world_up_of([capture])) for capture in captures)
-            else:
-                episodes = list(captures)
-                up = world_up_of(episodes)
-                yield from (episode.trajectory(up) for episode in episodes)
+            try:
+                yield from self._of_dataset(folder)
+            except DataError as error:
+                yield error
+
+    def _of_dataset(self, folder: Path) -> Iterator[ForeignTrajectory | DataError]:
+        """Read every episode of a dataset."""
+        captures: Iterable[Capture | DataError] = Dataset(folder, self.settings).captures()
+        up = UP_OF_ROBOTS if self.settings.axes == ROBOT else None
+        if up is None and self.settings.scene != "episode":
+            captures = list(captures)
+            usable = [capture for capture in captures if isinstance(capture, Capture)]
+            up = world_up_of(usable) if usable else None
+        for capture in captures:
+            try:
+                yield capture if isinstance(capture, DataError) else capture.trajectory(up or world_up_of([capture]))
+            except DataError as error:
+                yield error
 
 
 @dataclass(frozen=True)
@@ -104,17 +113,22 @@ class Dataset:
         self._chosen = settings.chosen_episodes()
         self._numbers: Numbers | None = None  # of the file that was read last
 
-    def captures(self) -> Iterator[Capture]:
-        """Yield every episode that is to be read.
+    def captures(self) -> Iterator[Capture | DataError]:
+        """Yield every episode that is to be read; of one whose files or poses cannot be used, why.
 
         Raises:
-            DataError: when there is none, a file of one is missing or damaged, or none of its poses can be used.
+            DataError: when there is none, or what says where they are is missing or damaged.
         """
         chosen = 0
         for episode in self._episodes():
             if self._chosen is None or episode.number in self._chosen:
                 chosen += 1
-                yield self._capture(episode)
+                try:
+                    capture = self._capture(episode)
+                except DataError as error:
+                    yield error
+                else:
+                    yield capture
         if not chosen:
             raise DataError(f"{self.path.parent / EPISODES}: has no episode {self.settings.episodes}")
 

@@ -21,6 +21,7 @@ from persist_cli.data.importers.captures import (
     Capture,
     CapturedFrame,
     checked_pose,
+    each_or_cause,
     folders_with,
     numbered,
 )
@@ -37,7 +38,7 @@ DISTORTION: Final = ("k1", "k2", "p1", "p2", "k3")  # in OpenCV's order
 class Nerfstudio(Importer):
     """The importer of one capture, or of a folder of captures."""
 
-    def trajectories(self, source: Path) -> Iterator[ForeignTrajectory]:
+    def trajectories(self, source: Path) -> Iterator[ForeignTrajectory | DataError]:
         """Read every capture of ``source``, each a scene of its own.
 
         Raises:
@@ -48,8 +49,7 @@ class Nerfstudio(Importer):
         else:
             folders = folders_with(TRANSFORMS, source, f"{TRANSFORMS} in it nor folders with one")
             files = [folder / TRANSFORMS for folder in folders]
-        for file in files:
-            yield read_transforms(file).trajectory(Z_UP)
+        return each_or_cause(files, lambda file: read_transforms(file).trajectory(Z_UP))
 
 
 def read_transforms(file: Path) -> Capture:

@@ -27,6 +27,7 @@ from persist_cli.data.importers.captures import (
     OPENCV_FROM_OPENGL,
     Capture,
     CapturedFrame,
+    each_or_cause,
     quaternion_pose,
     world_up_of,
 )
@@ -45,7 +46,7 @@ NEEDED: Final = "needs the package lzfse: pip install 'persist-cli[record3d]'"
 class Record3D(Importer):
     """The importer of one ``.r3d`` file, or of a folder of them."""
 
-    def trajectories(self, source: Path) -> Iterator[ForeignTrajectory]:
+    def trajectories(self, source: Path) -> Iterator[ForeignTrajectory | DataError]:
         """Read every recording of ``source``, each a scene of its own.
 
         Raises:
@@ -57,9 +58,12 @@ class Record3D(Importer):
         if not files:
             raise DataError(f"{source}: neither a {SUFFIX} file nor a folder with some")
         unpack = _unpacker()
-        for file in files:
+
+        def trajectory(file: Path) -> ForeignTrajectory:
             capture = read_recording(file, unpack)
-            yield capture.trajectory(world_up_of([capture]))
+            return capture.trajectory(world_up_of([capture]))
+
+        return each_or_cause(files, trajectory)
 
 
 class Archive:

@@ -18,6 +18,7 @@ from persist_cli.data.importers.captures import (
     Z_UP,
     Capture,
     CapturedFrame,
+    each_or_cause,
     folders_with,
     numbered,
     read_pose,
@@ -36,14 +37,14 @@ ALIKE: Final = 1e-3  # of a transform that changes nothing
 class ScanNet(Importer):
     """The importer of one scan, or of a folder of scans."""
 
-    def trajectories(self, source: Path) -> Iterator[ForeignTrajectory]:
+    def trajectories(self, source: Path) -> Iterator[ForeignTrajectory | DataError]:
         """Read every scan of ``source``, each a scene of its own.
 
         Raises:
             DataError: when there is none, or what a whole scan needs is missing or wrong.
         """
-        for folder in folders_with("pose", source, "color, depth and pose folders in it nor scans that have them"):
-            yield read_scan(folder).trajectory(Z_UP)
+        folders = folders_with("pose", source, "color, depth and pose folders in it nor scans that have them")
+        return each_or_cause(folders, lambda folder: read_scan(folder).trajectory(Z_UP))
 
 
 def read_scan(folder: Path) -> Capture:

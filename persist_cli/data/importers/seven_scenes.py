@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from persist_cli.api.importer import ForeignTrajectory, Importer
-from persist_cli.data.importers.captures import Capture, CapturedFrame, numbered, read_pose, world_up_of
+from persist_cli.data.importers.captures import Capture, CapturedFrame, each_or_cause, numbered, read_pose, world_up_of
 from persist_cli.data.importers.gravity import Direction
 from persist_cli.data.importers.lenses import Lens
 from persist_cli.data.importers.readers import INTRINSICS, color_file, depth_file, read_lens
@@ -29,7 +29,7 @@ FRAMES_PER_SECOND = 30.0
 class SevenScenes(Importer):
     """The importer of one sequence, or of a scene whose ``seq-*`` folders are its trajectories."""
 
-    def trajectories(self, source: Path) -> Iterator[ForeignTrajectory]:
+    def trajectories(self, source: Path) -> Iterator[ForeignTrajectory | DataError]:
         """Read every sequence of ``source`` as a trajectory named after its scene.
 
         Raises:
@@ -42,10 +42,14 @@ class SevenScenes(Importer):
         if not folders:
             raise DataError(f"{source}: neither frame-*.color files nor seq-* folders in it")
         up: tuple[Direction, str] | None = None
-        for folder in folders:
+
+        def trajectory(folder: Path) -> ForeignTrajectory:
+            nonlocal up
             sequence = read_sequence(folder)
             up = up or world_up_of(_of_one_world(folder, sequence))
-            yield sequence.trajectory(up)
+            return sequence.trajectory(up)
+
+        return each_or_cause(folders, trajectory)
 
 
 def read_sequence(folder: Path) -> Capture:

@@ -18,7 +18,14 @@ import torch
 
 from persist_cli.api.cameras import check_intrinsics
 from persist_cli.api.importer import ForeignTrajectory, Importer
-from persist_cli.data.importers.captures import Y_UP, Capture, CapturedFrame, folders_with, quaternion_pose
+from persist_cli.data.importers.captures import (
+    Y_UP,
+    Capture,
+    CapturedFrame,
+    each_or_cause,
+    folders_with,
+    quaternion_pose,
+)
 from persist_cli.data.importers.lenses import Array, Lens
 from persist_cli.data.importers.readers import StoredImage, read_depth, read_levels, read_matrix, sure_depth
 from persist_cli.data.importers.videos import VideoFrames
@@ -34,14 +41,14 @@ COLUMNS: Final = ("timestamp", "frame", *POSE)
 class StrayScanner(Importer):
     """The importer of one scan, or of a folder of scans."""
 
-    def trajectories(self, source: Path) -> Iterator[ForeignTrajectory]:
+    def trajectories(self, source: Path) -> Iterator[ForeignTrajectory | DataError]:
         """Read every scan of ``source``, each a scene of its own.
 
         Raises:
             DataError: when there is none, or what a whole scan needs is missing or wrong.
         """
-        for folder in folders_with(ODOMETRY, source, f"{ODOMETRY} in it nor folders with one"):
-            yield read_scan(folder).trajectory(Y_UP)
+        folders = folders_with(ODOMETRY, source, f"{ODOMETRY} in it nor folders with one")
+        return each_or_cause(folders, lambda folder: read_scan(folder).trajectory(Y_UP))
 
 
 def read_scan(folder: Path) -> Capture:

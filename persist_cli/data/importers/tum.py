@@ -21,7 +21,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from persist_cli.api.importer import ForeignTrajectory, Importer
-from persist_cli.data.importers.captures import Z_UP, Capture, CapturedFrame, folders_with
+from persist_cli.data.importers.captures import Z_UP, Capture, CapturedFrame, each_or_cause, folders_with
 from persist_cli.data.importers.lenses import Array, Lens
 from persist_cli.data.importers.readers import INTRINSICS, color_file, depth_file, read_lens
 from persist_cli.errors import DataError
@@ -55,14 +55,14 @@ class Listing:
 class TumRgbd(Importer):
     """The importer of one recording, or of a folder of recordings."""
 
-    def trajectories(self, source: Path) -> Iterator[ForeignTrajectory]:
+    def trajectories(self, source: Path) -> Iterator[ForeignTrajectory | DataError]:
         """Read every recording of ``source``, each a scene of its own.
 
         Raises:
             DataError: when there is none, or what a whole recording needs is missing or wrong.
         """
-        for folder in folders_with(LISTS[0], source, f"{', '.join(LISTS)} in it nor folders with them"):
-            yield read_recording(folder).trajectory(Z_UP)
+        folders = folders_with(LISTS[0], source, f"{', '.join(LISTS)} in it nor folders with them")
+        return each_or_cause(folders, lambda folder: read_recording(folder).trajectory(Z_UP))
 
 
 def read_recording(folder: Path) -> Capture:

@@ -130,8 +130,8 @@ def test_what_is_neither_a_frame_nor_a_data_error_is_refused(refused, tmp_path: 
     ("wrong", "cause"),
     [
         (lambda: None, "trajectories() returned None, no iterator"),
-        (lambda: [None], "it yields None, no ForeignTrajectory"),
-        (lambda: [{"name": "walk"}], "it yields {'name': 'walk'}, no ForeignTrajectory"),
+        (lambda: [None], "it yields None, neither a ForeignTrajectory nor a DataError"),
+        (lambda: [{"name": "walk"}], "it yields {'name': 'walk'}, neither a ForeignTrajectory nor a DataError"),
         (lambda: [replace(trajectory(), info=None)], "trajectory 'walk': its info is None, no TrajectoryInfo"),
         (lambda: [replace(trajectory(), frames=None)], "trajectory 'walk': its frames are None, no iterator"),
         (lambda: [trajectory(length=None)], "trajectory 'walk': its length is None, not a number of frames"),

@@ -21,7 +21,7 @@ from persist_cli.data.importers.tum import TumRgbd, poses_at, read_listing
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError
 from persist_cli.plugins import load_plugin
-from tests.support.foreign_captures import ROOM, poses, write_nerfstudio, write_scannet, write_tum
+from tests.support.foreign_captures import ROOM, poses, usable, write_nerfstudio, write_scannet, write_tum
 from tests.support.rooms import walk
 
 FORMATS: dict[str, tuple[type[Importer], Callable[..., Path]]] = {
@@ -31,7 +31,7 @@ EXACT = {"tum": 0.00011, "scannet": 0.00051, "nerfstudio": 0.00051}  # metres, h
 
 
 def read(name: str, source: Path) -> ForeignTrajectory:
-    (trajectory,) = FORMATS[name][0]().trajectories(source)
+    (trajectory,) = usable(FORMATS[name][0](), source)
     return trajectory
 
 
@@ -75,10 +75,10 @@ def test_an_imported_capture_can_be_inspected(name: str, capture: Path, persist:
 def test_a_folder_of_captures_is_as_many_scenes(name: str, capture: Path, tmp_path: Path) -> None:
     shutil.copytree(capture, tmp_path / "all/a")
     shutil.copytree(capture, tmp_path / "all/b")
-    trajectories = list(FORMATS[name][0]().trajectories(tmp_path / "all"))
+    trajectories = usable(FORMATS[name][0](), tmp_path / "all")
     assert [(one.name, one.info.scene) for one in trajectories] == [("a", "a"), ("b", "b")]
     with pytest.raises(DataError, match=r"nowhere: neither "):
-        list(FORMATS[name][0]().trajectories(tmp_path / "nowhere"))
+        usable(FORMATS[name][0](), tmp_path / "nowhere")
 
 
 def test_the_importers_are_plugins(name: str) -> None:

@@ -25,6 +25,7 @@ from persist_cli.data.importers.videos import VideoFrames
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError, PersistError
 from persist_cli.plugins import load_plugin
+from tests.support.foreign_captures import usable
 from tests.support.phone_captures import (
     ROOM,
     relative_poses,
@@ -38,12 +39,12 @@ from tests.support.rooms import walk
 
 
 def stray(source: Path) -> ForeignTrajectory:
-    (trajectory,) = StrayScanner().trajectories(source)
+    (trajectory,) = usable(StrayScanner(), source)
     return trajectory
 
 
 def record3d(source: Path) -> ForeignTrajectory:
-    (trajectory,) = Record3D().trajectories(source)
+    (trajectory,) = usable(Record3D(), source)
     return trajectory
 
 

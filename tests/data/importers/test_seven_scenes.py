@@ -19,6 +19,7 @@ from persist_cli.data.importers.seven_scenes import SevenScenes
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError, PersistError, PluginError
 from persist_cli.io.files import ASIDE
+from tests.support.foreign_captures import usable
 from tests.support.rooms import UP, Room, walk, write_sequence
 
 ROOM = Room()
@@ -30,7 +31,7 @@ def sequence(tmp_path: Path) -> Path:
 
 
 def test_a_sequence_is_imported_as_it_was(sequence: Path) -> None:
-    (trajectory,) = SevenScenes().trajectories(sequence)
+    (trajectory,) = usable(SevenScenes(), sequence)
     assert (trajectory.name, trajectory.info.scene, trajectory.length) == ("kitchen", "kitchen", 4)
     assert trajectory.info.intrinsics == pytest.approx(ROOM.intrinsics)
     for frame, truth in zip(trajectory.frames, ROOM.frames(walk(24)[:4]), strict=True):
@@ -41,7 +42,7 @@ def test_a_sequence_is_imported_as_it_was(sequence: Path) -> None:
 
 
 def test_depth_of_0_and_65535_is_missing(sequence: Path) -> None:
-    (trajectory,) = SevenScenes().trajectories(sequence)
+    (trajectory,) = usable(SevenScenes(), sequence)
     assert next(trajectory.frames).depth[0, :2].tolist() == [0, 0]
 
 
@@ -106,7 +107,7 @@ def test_an_up_axis_without_level_surfaces_is_said_to_be_guessed(persist, sequen
 
 
 def test_timestamps_follow_the_frame_numbers(sequence: Path) -> None:
-    (trajectory,) = SevenScenes().trajectories(sequence)
+    (trajectory,) = usable(SevenScenes(), sequence)
     assert [frame.timestamp for frame in trajectory.frames] == pytest.approx([0, 0.1, 0.2, 0.3])
 
 
