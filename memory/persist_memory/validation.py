@@ -10,26 +10,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from persist_cli.api.cameras import check_poses
 from persist_cli.api.memory import Memory
 from persist_cli.api.observations import Observations, Origin, origins_like
-from persist_cli.errors import CheckpointError, DataError
+from persist_cli.errors import CheckpointError
 
 Shape = tuple[int | None, ...]  # None first: as many rows as the first tensor has; None later: any size
 
 ORIGINS = "origins"  # the tensor with the origin of each stored item
 
 NAMED = 5  # names that a message lists at most
-
-
-def check_observations(observations: Observations, where: str) -> None:
-    """Raise ``DataError`` naming ``where`` when poses are not finite and rigid or sizes do not agree."""
-    cameras = observations.cameras
-    size = (len(observations), cameras.height, cameras.width)
-    sizes = {tuple(observations.rgb.shape[:3]), tuple(observations.depth.shape), size}
-    if len(sizes) > 1 or not len(cameras) == len(observations.origins) == len(observations):
-        raise DataError(f"{where}: rgb, depth, cameras and origins differ in frames or size: {sorted(sizes)}")
-    check_poses(cameras.world_from_camera.cpu(), where)
 
 
 def with_finite_depth(observations: Observations) -> Observations:

@@ -66,7 +66,7 @@ class ActionVocabulary:
         for action in self.actions:
             if action.name == name:
                 return action
-        nearest = nearest_name(name, self.names)
+        nearest = nearest_name(str(name), self.names)
         meant = f"did you mean {nearest!r}? " if nearest else ""
         raise DataError(f"unknown action {name!r}; {meant}known: {self.listing()}")
 
@@ -137,6 +137,12 @@ class ActionVocabulary:
             reverses.append(reverse)
         return tuple(reverses)
 
+    def motion(self, name: str) -> Action:
+        """Return an action that says how it moves; ``DataError`` for an unknown one and for ``free``."""
+        if name == FREE:
+            raise DataError("the action 'free' has no motion of its own; follow the trajectory's poses instead")
+        return self[name]
+
     def move(
         self, world_from_camera: Float[Tensor, "4 4"], name: str, world_up: Float[Tensor, " 3"]
     ) -> Float[Tensor, "4 4"]:
@@ -150,9 +156,7 @@ class ActionVocabulary:
         Raises:
             DataError: for an unknown action and for ``free``, which has no motion of its own.
         """
-        if name == FREE:
-            raise DataError("the action 'free' has no motion of its own; follow the trajectory's poses instead")
-        action = self[name]
+        action = self.motion(name)
         pose = world_from_camera.double().clone()
         up = world_up.double() / world_up.double().norm()
         heading = pose[:3, 2] - up * (up @ pose[:3, 2])

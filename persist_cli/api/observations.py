@@ -13,8 +13,9 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from persist_cli.api.actions import ActionVocabulary
-from persist_cli.api.cameras import Cameras
+from persist_cli.api.cameras import Cameras, check_poses
 from persist_cli.api.cells import CellGrid
+from persist_cli.errors import DataError
 
 
 @dataclass(frozen=True)
@@ -124,6 +125,30 @@ class Observations:
             Cameras.concatenate([part.cameras for part in parts]),
             torch.cat([part.origins for part in parts]),
         )
+
+
+def check_observations(observations: Observations, where: str) -> None:
+    """Check that frames agree in number and size, and their types and poses.
+
+    Args:
+        observations: the frames.
+        where: what an error begins with.
+
+    Raises:
+        DataError: when sizes differ, colours are not uint8, depth is not of floats, or a pose is not finite and rigid.
+    """
+    cameras, rgb, depth = observations.cameras, observations.rgb, observations.depth
+    size = (len(observations), cameras.height, cameras.width)
+    sizes = {tuple(rgb.shape[:3]), tuple(depth.shape), size}
+    if len(sizes) > 1 or not len(cameras) == len(observations.origins) == len(observations):
+        raise DataError(f"{where}: rgb, depth, cameras and origins differ in frames or size: {sorted(sizes)}")
+    if rgb.dtype != torch.uint8 or rgb.shape[3:] != (3,):
+        raise DataError(
+            f"{where}: rgb is {rgb.dtype} {list(rgb.shape)}, not uint8 [frame, height, width, 3] of 0 to 255"
+        )
+    if not depth.is_floating_point():
+        raise DataError(f"{where}: depth is {depth.dtype}, not floats in metres")
+    check_poses(cameras.world_from_camera.cpu(), where)
 
 
 def origins_like(rows: Tensor, origin: Origin) -> UInt8[Tensor, " row"]:

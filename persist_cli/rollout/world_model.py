@@ -27,6 +27,7 @@ from persist_cli.api.scene import Scene
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.data.clips import interactions_of
 from persist_cli.errors import PersistError
+from persist_cli.rollout.arguments import check_starts, checked_actions
 from persist_cli.rollout.surroundings import Surroundings, Walk, plan_walks
 
 SEEDS: Final = 2**31  # of the sampling noise of an agent
@@ -224,7 +225,12 @@ class WorldModel:
         self._clip_frames = frames
 
     def reset(self, observations: Sequence[Observations], infos: Sequence[TrajectoryInfo]) -> None:
-        """Let each agent begin at one observed frame; its info has the frame's scene, up axis and vocabulary."""
+        """Let each agent begin at one observed frame; its info has the frame's scene, up axis and vocabulary.
+
+        Raises:
+            PersistError: when there is not one whole frame for each agent; nothing has changed then.
+        """
+        check_starts(observations, infos, len(self.agents))
         for agent, observation, info in zip(self.agents, observations, infos, strict=True):
             agent.begin(observation, info)
             agent.memorize(observation, self.backbone.device)
@@ -251,14 +257,9 @@ class WorldModel:
                 leave it out.
 
         Raises:
-            PersistError: when there is not one list of actions for each agent, or a list is empty.
+            PersistError: before ``reset``, and when the actions are not such lists; nothing has changed then.
         """
-        if not self.agents or len(self.agents) != len(actions) or not all(actions):
-            raise PersistError(
-                f"{len(self.agents)} branches were given {len(actions)} lists of {[*map(len, actions)]} "
-                "actions; each needs one of at least one action"
-            )
-        left = [tuple(names) for names in actions]
+        left = checked_actions(actions, [getattr(agent, "info", None) for agent in self.agents])
         while any(left):
             most, agents = self.clip_frames - 1, self.agents
             walks = [agent.set_out(names, most) for agent, names in zip(agents, left, strict=True)]

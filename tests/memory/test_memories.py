@@ -7,7 +7,7 @@ import torch
 from persist_cli.api.memory import FrameOfReference
 from persist_cli.api.memory_file import FORMAT_VERSION
 from persist_cli.api.tokens import MemoryTokens
-from persist_cli.errors import CheckpointError, PersistError
+from persist_cli.errors import CheckpointError, DataError, PersistError
 from persist_cli.plugins import make_encoder, make_memory
 from tests.support.room_views import MEMORIES, empty_memory, observe, room_walk, same_bits, written_memory
 from tests.support.rooms import UP, look
@@ -154,6 +154,23 @@ def test_one_memory_takes_frames_of_several_sizes(name):
     wide = observe([look((0.0, 1.4, 0.0), 45.0)], 40, 90)
     memory.write(wide)
     assert len(memory.read(wide.cameras, 20)) == (0 if name == "none" else 20)
+
+
+@pytest.mark.parametrize("name", ["voxel", "map2d", "snapshots", "points", "scene"])
+@pytest.mark.parametrize(
+    ("spoil", "cause"),
+    [
+        (lambda frames: replace(frames, rgb=frames.rgb / 255), "rgb is torch.float32"),
+        (lambda frames: replace(frames, rgb=frames.rgb[..., :1]), r"rgb is torch.uint8 \[1, .*, 1\]"),
+        (lambda frames: replace(frames, depth=(frames.depth * 1000).short()), "depth is torch.int16"),
+    ],
+)
+def test_frames_of_another_type_are_refused_and_nothing_is_written(name, spoil, cause):
+    encoder = make_encoder("classes" if name == "scene" else "patches", {})
+    memory = make_memory(name, {}, encoder, FrameOfReference("room", UP))
+    with pytest.raises(DataError, match=cause):
+        memory.write(spoil(room_walk(1)))
+    assert memory.tensors() == {}
 
 
 @pytest.mark.parametrize(

@@ -131,7 +131,7 @@ def test_branches_that_cannot_work_are_refused(start):
     model = start()
     with pytest.raises(PersistError, match="0 branches of a rollout; it must be at least 1"):
         model.branches(0)
-    with pytest.raises(PersistError, match="2 branches were given 1 lists"):
+    with pytest.raises(PersistError, match="2 agents were given 1 lists"):
         model.branches(2).step([["left"]])
     with pytest.raises(PersistError, match=r"lists of \[1, 0\] actions"):
         model.branches(2).step([["left"], []])

@@ -14,11 +14,11 @@ from torch import Tensor
 
 from persist_cli.api.cameras import Cameras, check_intrinsics, check_poses
 from persist_cli.api.memory import Memory, MemoryFigures
-from persist_cli.api.observations import Observations, Origin
+from persist_cli.api.observations import Observations, Origin, check_observations
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import DataError
 from persist_memory.detail import pixels_across
-from persist_memory.validation import check_observations, check_origins, check_tensors
+from persist_memory.validation import check_origins, check_tensors
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from persist_cli.api.cameras import Cameras
 from persist_cli.api.cells import CellOrigin
 from persist_cli.api.encoder import Encoder
 from persist_cli.api.memory import FrameOfReference, MapPoints, Memory, MemoryFigures
-from persist_cli.api.observations import Observations, Origin, origins_like
+from persist_cli.api.observations import Observations, Origin, check_observations, origins_like
 from persist_cli.api.scene_edits import Edit, EditOutcome
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError
@@ -38,7 +38,6 @@ from persist_memory.validation import (
     ORIGINS,
     Shape,
     check_mergeable,
-    check_observations,
     check_origins,
     check_tensors,
     with_origins,

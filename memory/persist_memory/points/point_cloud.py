@@ -15,7 +15,7 @@ from persist_cli.api.cameras import Cameras
 from persist_cli.api.encoder import Encoder
 from persist_cli.api.geometry import project, unproject
 from persist_cli.api.memory import FrameOfReference, MapPoints, Memory, MemoryFigures
-from persist_cli.api.observations import Observations, Origin, origins_like
+from persist_cli.api.observations import Observations, Origin, check_observations, origins_like
 from persist_cli.api.tokens import MemoryTokens
 from persist_memory.grid.occlusion import covered, without_known
 from persist_memory.metres import Metres
@@ -23,7 +23,6 @@ from persist_memory.validation import (
     ORIGINS,
     Shape,
     check_mergeable,
-    check_observations,
     check_origins,
     check_tensors,
     with_finite_depth,

@@ -18,7 +18,7 @@ from persist_cli.api.encoder import Encoder
 from persist_cli.api.geometry import camera_rays
 from persist_cli.api.ground import Body, ground_axes
 from persist_cli.api.memory import FrameOfReference, MapPoints, Memory, MemoryFigures
-from persist_cli.api.observations import Observations, Origin
+from persist_cli.api.observations import Observations, Origin, check_observations
 from persist_cli.api.scene import Scene
 from persist_cli.api.scene_edits import Edit, EditOutcome
 from persist_cli.api.stages import Stage
@@ -43,7 +43,7 @@ from persist_memory.scene.imagination import (
 )
 from persist_memory.scene.interaction import LOAD, Load, Reached, changed_cells, reached_box, read_load
 from persist_memory.scene.settings import GridSceneSettings
-from persist_memory.validation import check_mergeable, check_observations, with_finite_depth
+from persist_memory.validation import check_mergeable, with_finite_depth
 
 MOST_FORESEEN = 10_000  # cameras that are kept of those that see nothing unknown
 

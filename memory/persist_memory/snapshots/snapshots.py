@@ -18,7 +18,7 @@ from torch import Tensor
 from persist_cli.api.cameras import Cameras, check_intrinsics, check_poses
 from persist_cli.api.encoder import Encoder
 from persist_cli.api.memory import FrameOfReference, MapPoints, Memory, MemoryFigures
-from persist_cli.api.observations import Observations, Origin, origins_like
+from persist_cli.api.observations import Observations, Origin, check_observations, origins_like
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError
 from persist_memory.batched_reads import distinct_cameras, same_size
@@ -29,7 +29,6 @@ from persist_memory.snapshots.snapshot_store import SnapshotStore
 from persist_memory.validation import (
     ORIGINS,
     check_mergeable,
-    check_observations,
     check_origins,
     check_tensors,
     with_origins,
