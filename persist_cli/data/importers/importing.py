@@ -256,7 +256,7 @@ def import_trajectories(
 
 
 def _whole(importer: Importer, source: Path, plan: ImportPlan, causes: dict[str, None]) -> Iterator[ForeignTrajectory]:
-    """Yield the trajectories that can be used; why others cannot gets into ``causes``, or is raised."""
+    """Yield the trajectories that can be used; why others cannot is put into ``causes``, or raised."""
     several = False
     for trajectory in checked_trajectories(importer, source):
         if not isinstance(trajectory, DataError):

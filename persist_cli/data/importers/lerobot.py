@@ -47,7 +47,7 @@ class LeRobot(Importer):
         """Read every episode of every dataset of ``source``.
 
         Raises:
-            DataError: when there is none, the settings name what it does not have, or a file is missing or damaged.
+            DataError: when there is none.
         """
         for folder in folders_with(META, source, f"{META}/{INFO} in it nor folders with one"):
             try:

@@ -42,7 +42,7 @@ class Nerfstudio(Importer):
         """Read every capture of ``source``, each a scene of its own.
 
         Raises:
-            DataError: when there is none, or what a whole capture needs is missing or wrong.
+            DataError: when there is none.
         """
         if source.is_file():
             files = [Path(os.path.abspath(source))]

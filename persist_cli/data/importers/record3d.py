@@ -50,7 +50,7 @@ class Record3D(Importer):
         """Read every recording of ``source``, each a scene of its own.
 
         Raises:
-            DataError: when there is none, or what a whole recording needs is missing or wrong.
+            DataError: when there is none.
             PersistError: when the package that unpacks depth is not installed.
         """
         source = Path(os.path.abspath(source))

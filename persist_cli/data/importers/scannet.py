@@ -41,7 +41,7 @@ class ScanNet(Importer):
         """Read every scan of ``source``, each a scene of its own.
 
         Raises:
-            DataError: when there is none, or what a whole scan needs is missing or wrong.
+            DataError: when there is none.
         """
         folders = folders_with("pose", source, "color, depth and pose folders in it nor scans that have them")
         return each_or_cause(folders, lambda folder: read_scan(folder).trajectory(Z_UP))

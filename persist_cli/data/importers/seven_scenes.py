@@ -33,7 +33,7 @@ class SevenScenes(Importer):
         """Read every sequence of ``source`` as a trajectory named after its scene.
 
         Raises:
-            DataError: when there is none, or what a whole sequence needs is missing or wrong.
+            DataError: when there is none.
         """
         source = Path(os.path.abspath(source))  # a link keeps its own name
         if not source.is_dir():

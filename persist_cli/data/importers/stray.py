@@ -45,7 +45,7 @@ class StrayScanner(Importer):
         """Read every scan of ``source``, each a scene of its own.
 
         Raises:
-            DataError: when there is none, or what a whole scan needs is missing or wrong.
+            DataError: when there is none.
         """
         folders = folders_with(ODOMETRY, source, f"{ODOMETRY} in it nor folders with one")
         return each_or_cause(folders, lambda folder: read_scan(folder).trajectory(Y_UP))

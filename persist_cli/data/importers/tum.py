@@ -59,7 +59,7 @@ class TumRgbd(Importer):
         """Read every recording of ``source``, each a scene of its own.
 
         Raises:
-            DataError: when there is none, or what a whole recording needs is missing or wrong.
+            DataError: when there is none.
         """
         folders = folders_with(LISTS[0], source, f"{', '.join(LISTS)} in it nor folders with them")
         return each_or_cause(folders, lambda folder: read_recording(folder).trajectory(Z_UP))
