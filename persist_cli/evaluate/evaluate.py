@@ -59,6 +59,7 @@ def run_eval(paths: Sequence[Path], plan: EvalPlan, out: Path, report: Path | No
             check_folder(folder)
     processes = Processes()
     with exclusive(out, processes.main):
+        plan.folders  # noqa: B018  data that are not there are reported before a model is loaded
         run, loader = prepare(paths or [reference_checkpoint()], plan, out, processes)
         measure_rows(run, loader, processes)
         if not processes.main:
