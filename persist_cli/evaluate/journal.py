@@ -119,7 +119,17 @@ class Journal:
         return (self.folder / ROWS).is_file()
 
     def name_rows(self, names: Sequence[str]) -> None:
-        """Keep the names of the rows by number; they may hold folders of checkpoints, which may be moved later."""
+        """Keep the names of the rows by number; they may hold folders of checkpoints, which may be moved later.
+
+        Raises:
+            DataError: when there were more rows, or fewer, so that the numbers may mean others.
+        """
+        kept = len(read_json(self.folder / ROWS)) if self.names_rows else len(names)
+        if kept != len(names):
+            raise DataError(
+                f"{self.folder.parent}: begun by an earlier version, with {kept} rows and not {len(names)}; choose "
+                "another --out or delete it"
+            )
         write_json(self.folder / ROWS, list(names))
 
     def has(self, part: Unit | ExampleClip) -> bool:

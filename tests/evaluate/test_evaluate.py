@@ -247,6 +247,15 @@ def test_data_without_depth_is_measured_by_metrics_and_controls_that_need_none(p
     assert {name: len(bounds[name]) for name in windows} == {name: len(values) for name, values in windows.items()}
 
 
+def test_clips_without_depth_beside_others_are_not_warped_since_their_warp_would_be_black(
+    persist, voxel, held_out, tmp_path
+):
+    data = without_depth(held_out, tmp_path / "data")
+    command = ["eval", voxel, "--data", held_out, "--data", data, "--protocol", "return", "--memories", "voxel"]
+    refused = persist(*command, "--metrics", "psnr", "--controls", "warp", "--out", tmp_path / "o")
+    assert f"the control 'warp' needs depth, which {data}" in refused.err
+
+
 @pytest.fixture
 def one_room(held_out, tmp_path):
     """The held_out, of one room alone."""

@@ -44,9 +44,13 @@ INTERVENTIONS: dict[str, Callable[[RowConfig, Sequence[Case]], MemoryInterventio
 
 
 def no_depth(cases: Sequence[Case]) -> str | None:
-    """The reason why earlier frames cannot be warped, ``None`` when the cases have depth."""
-    missing = all(share is None for case in cases for share in case.seen_before)
-    return "needs depth, which the data does not have" if missing else None
+    """The reason why earlier frames cannot be warped, ``None`` when all cases have depth.
+
+    The warp of a clip without depth would be black, and its figures would make the mean look worse than warping is.
+    """
+    lacking = [case for case in cases if all(share is None for share in case.seen_before)]
+    where = "the data" if len(lacking) == len(cases) else str(lacking[0].file.path) if lacking else ""
+    return f"needs depth, which {where} does not have" if where else None
 
 
 def no_cells(cases: Sequence[Case]) -> str | None:
