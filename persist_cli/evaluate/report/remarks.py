@@ -14,6 +14,9 @@ from persist_cli.evaluate.statistics import LEAST_MODELS, LEAST_UNITS
 
 MOST_SCENES = 3  # names or ranges of scenes in a warning
 
+ALL_COUNT = ("kd-dinov2", "src", "src-patch", "src-away", "psnr-own", "lpips-own", "rot-error", "trans-error")
+"""Metrics that do not compare a frame with the true one of its pose, so that they leave out none."""
+
 FETCH = re.compile(r"weights \S.* are not here: (?P<command>persist weights fetch) (?P<name>\S+)(?P<options>.*)")
 
 
@@ -133,11 +136,21 @@ def new_poses_line(results: EvalResults) -> str:
     if protocol.new_poses is None or not (protocol.new_poses.metres and protocol.new_poses.degrees):
         return "every predicted frame counts, also where the memory holds a frame of the same pose"
     limits = f"{protocol.new_poses.metres:g} m and {protocol.new_poses.degrees:g}°"
-    whole = [title for name, title in (("fvd", "FVD"),) if name in results.measured.metrics]
+    whole, all_frames = measured_titles(results, ("fvd",)), measured_titles(results, ALL_COUNT)
     return (
         f"{protocol.counted_frames} of {protocol.predicted_frames} predicted frames count: those to which no frame in "
-        f"memory is nearer than {limits}" + f"; {', '.join(whole)}: whole videos" * bool(whole)
+        f"memory is nearer than {limits}"
+        + f"; {', '.join(whole)}: whole videos" * bool(whole)
+        + f"; {', '.join(all_frames)}: the others, too" * bool(all_frames)
     )
+
+
+def measured_titles(results: EvalResults, names: Sequence[str]) -> list[str]:
+    """Titles of those of some metrics of which a row has a figure."""
+    rows = [row for table in results.tables for row in table.rows.values()]
+    found = {key for row in rows for key, cell in row.columns.items() if cell.mean is not None}
+    measured = {column.metric for key, column in results.columns.items() if key in found}
+    return [metric.title for name, metric in results.measured.metrics.items() if name in names and name in measured]
 
 
 def contamination_lines(results: EvalResults) -> list[str]:

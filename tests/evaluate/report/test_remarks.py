@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from persist_cli.evaluate.report.remarks import (
+    ALL_COUNT,
     contamination,
     contamination_lines,
     left_out_line,
+    new_poses_line,
     unknown_scenes_lines,
 )
 from persist_cli.evaluate.report.result_file import check_results
 from persist_cli.evaluate.report.text import table_text
+from persist_cli.metrics import METRICS
 from tests.support.example_results import example_results
 
 
@@ -58,3 +61,18 @@ def test_results_that_do_not_know_all_training_scenes_say_so():
         ({"known": 4, "complete": True}, "4 training scenes"),  # as an earlier version wrote it
     ):
         assert f"{words}; the evaluated ones may be among them" in table_text(trained_on(scenes))
+
+
+def test_metrics_in_which_other_frames_count_too_are_named_where_frames_are_counted():
+    results = example_results()
+    limits = {"new_poses": {"metres": 0.2, "degrees": 10.0}, "counted_frames": 40, "predicted_frames": 48}
+    results["measured"]["protocol"] |= limits
+    assert new_poses_line(check_results(results, "example")).endswith("0.2 m and 10°; SRC: the others, too")
+    for row in results["tables"][0]["rows"].values():
+        row["columns"]["src"] = {"na": "no clip returns"}
+    assert new_poses_line(check_results(results, "example")).endswith("0.2 m and 10°")
+
+
+def test_frames_are_left_out_of_all_metrics_that_compare_them_with_the_truth_of_their_pose():
+    kept = {name for name, metric in METRICS.items() if not getattr(metric, "compares_with_truth", False)}
+    assert {*ALL_COUNT} == kept - {"fvd"}
