@@ -6,6 +6,7 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -14,9 +15,10 @@ from persist_cli.evaluate.cases import CaseFrames, read_case
 from persist_cli.evaluate.columns import without_known_poses
 from persist_cli.evaluate.journal import ExampleClip, Unit
 from persist_cli.evaluate.measure import SHEET_CLIPS, predict
-from persist_cli.evaluate.metric_suite import FIGURES, VIDEO
+from persist_cli.evaluate.metric_suite import FIGURES, VIDEO, WEIGHTS
 from persist_cli.evaluate.plan import Evaluation
 from persist_cli.evaluate.report.pictures import ClipPicture, Pictures, RowPictures, Sheet
+from persist_cli.evaluate.statistics import weighted_mean
 from persist_cli.metrics.metric import Metric
 from persist_cli.output.console import add_task, progress
 
@@ -81,8 +83,14 @@ def row_pictures(
 
 def first_figures(run: Evaluation, row: int) -> Float[Tensor, " clip"]:
     """The first metric's mean over the predicted frames of each clip, at the first seed."""
+    suite = run.suites[row]
+    name = next(iter(suite.frame_metrics))
     figures = run.journal.gather(row, 0, run.batches, FIGURES)
-    return without_known_poses(run.suites[row].frame_metrics.values(), run.cases, figures)[:, 1:, 0].nanmean(dim=1)
+    values = without_known_poses(suite.frame_metrics.values(), run.cases, figures)[:, 1:, 0]
+    weights = torch.ones_like(values)
+    if suite.is_weighted(name):
+        weights = run.journal.gather(row, 0, run.batches, WEIGHTS + name)[:, 1:]
+    return torch.from_numpy(weighted_mean(values.numpy(), weights.numpy(), axis=1))
 
 
 def pick_clips(figures: Float[Tensor, " clip"], clips: Sequence[int], metric: Metric) -> list[int]:

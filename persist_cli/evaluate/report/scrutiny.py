@@ -186,11 +186,11 @@ def _networks(results: EvalResults) -> Answer:
 
 
 def _pictures(results: EvalResults) -> Answer:
-    metric = next(iter(results.measured.metrics.values()), None)
-    if metric is None:
-        return Answer("Are the pictures picked?", ())
-    line = f"each row's best, median and worst clip by {metric.title}, and the first clips of the list in every row"
-    return Answer("Are the pictures picked?", (line,))
+    rows = [row for table in results.tables for row in table.rows.values()]
+    firsts = dict.fromkeys(name for row in rows for name in [*row.curves][:1])  # only metrics of frames have curves
+    titles = " or ".join(results.measured.metrics[name].title for name in firsts)
+    picked = f"each row's best, median and worst clip by {titles}, and " if titles else ""
+    return Answer("Are the pictures picked?", (f"{picked}the first clips of the list in every row",))
 
 
 def _models(results: EvalResults) -> dict[str, RowRecord]:

@@ -156,3 +156,17 @@ def test_results_of_an_earlier_version_do_not_claim_that_all_rows_were_sampled_a
     known = answers(lambda results: results["sampling"].pop("sampling_of"))["What was chosen, and on which data?"]
     assert known.lines[0].startswith("models were sampled with 50 steps of ddim unless the row says otherwise, of")
     assert answers()["What was chosen, and on which data?"].lines[0].startswith("all models were sampled with")
+
+
+def test_clips_are_said_to_be_picked_by_the_metric_that_picks_them():
+    def only_sets(results):
+        for row in results["tables"][0]["rows"].values():
+            row["curves"] = {}
+
+    def of_frames(results):
+        voxel(results)["curves"] = {"lpips-alex": {}}
+        results["tables"][0]["rows"]["none"]["curves"] = {}
+
+    question = "Are the pictures picked?"
+    assert "best, median and worst clip by LPIPS" in answers(of_frames)[question].lines[0]
+    assert answers(only_sets)[question].lines == ("the first clips of the list in every row",)
