@@ -199,8 +199,10 @@ def compare_cells(a: Cell | None, b: Cell | None, clusters: Counts) -> ComparedC
         return ComparedCell(first, second, None)
     in_a, in_b = (np.array(cell.per_clip or [], dtype=np.float64) for cell in (a, b))
     gaps = in_b - in_a if len(in_a) == len(in_b) else np.array([])
-    if not np.isfinite(gaps).any():
+    if not len(gaps):
         return ComparedCell(first, second, second - first)
+    if not np.isfinite(gaps).any():  # the two figures are of other clips
+        return ComparedCell(first, second, None)
     weights = None if a.clip_weights is None else np.array(a.clip_weights)[None, None]  # those of the truth: b's too
     gap = mean_figure(gaps[None, None], Draws.of(clusters), weights)
     return ComparedCell(first, second, gap.mean, number(gap.low), number(gap.high), gap.units)

@@ -79,6 +79,20 @@ def test_a_clip_without_a_figure_in_one_run_is_no_pair(tmp_path):
     assert (cell.low, cell.high) == (None, None)  # of four pairs there is no interval
 
 
+def test_figures_of_other_clips_have_no_difference(tmp_path):
+    def keep(*clips):
+        def change(results):
+            cell = results["tables"][0]["rows"]["voxel"]["columns"]["psnr"]
+            cell["per_clip"] = [value if place in clips else None for place, value in enumerate(cell["per_clip"])]
+
+        return change
+
+    files = write_results(tmp_path, "a", keep(0, 1)), write_results(tmp_path, "b", keep(2, 3))
+    cell = compare_runs(*files).tables[0].rows["voxel"]["psnr"]
+    assert None not in (cell.a, cell.b)
+    assert cell.difference is None
+
+
 def test_runs_of_five_clips_are_compared_without_intervals_and_say_why(tmp_path, capsys):
     def fewer(results):
         results.update(example_results(clips=5))
