@@ -34,10 +34,12 @@ from persist_cli.bench.scenes.journal import SceneJournal
 from persist_cli.bench.scenes.training_houses import House, read_houses
 from persist_cli.bench.scenes.views import Region, View, near_camera, same_form, true_region
 from persist_cli.checkpoints.contamination import ALLOW, OTHER_DATA, ShownScene, known_names, refuse_training_scenes
+from persist_cli.checkpoints.lineage import MEMORY_FILE
 from persist_cli.checkpoints.scene_models import TrainedSceneModel, find_scene_model
 from persist_cli.data.reference import data_folder, parse_reference
 from persist_cli.data.store import Store, TrajectoryFile
 from persist_cli.errors import DataError, PersistError, hint
+from persist_cli.io.files import file_sha256
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.memorize.memory_config import plugin_settings, scene_config
 from persist_cli.navigation.ground_mapper import body_of
@@ -303,6 +305,8 @@ def part_identities(
         parts["return"] = model | rendering | {"steps": plan.rendering.steps}
         parts["edits"] = rendering | {"seed": plan.seed, "kinds": EDIT_KINDS}
     found = {name: values for name, values in parts.items() if name in plan.parts}
+    if plan.rendering is not None and {*RENDERED} & found.keys():
+        found |= adapter_identities(plan.rendering)
     if "completion" in plan.parts:
         looked_up = {"training houses": digest([f"{house.scene} {house.sha256}" for house in houses])}
         found |= {} if trained is None else {SceneCompletion.name: model}
@@ -319,7 +323,20 @@ def digest(names: Sequence[str]) -> str:
 
 
 def rendering_identity(plan: RenderingPlan) -> dict[str, Any]:
-    """Return JSON values of what draws the frames; memories may be added."""
+    """Return JSON values of what draws the frames, but for the adapters; memories may be added."""
     checkpoint = find_checkpoint(plan.checkpoint)
     sampling = asdict(checkpoint.sampling_with(plan.sampling)) | plan.placement.changes()
     return {"checkpoint": checkpoint.fingerprint, "sampling": sampling}
+
+
+def adapter_identities(plan: RenderingPlan) -> dict[str, dict[str, Any]]:
+    """Return for each adapter that draws frames the hashes of its weights and of what its memory is."""
+    folders = find_checkpoint(plan.checkpoint).adapters
+    return {
+        f"adapter {name}": {
+            "weights": file_sha256(folders[name] / "adapter.safetensors"),
+            "memory": file_sha256(folders[name] / MEMORY_FILE),
+        }
+        for name in plan.memories
+        if name in folders
+    }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 import torch
 
 from persist_cli.api.cameras import Cameras
+from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.scene_edits import Copy, Move
 from persist_cli.bench.scenes.edit_part import MOVED, draw_change
 from persist_cli.bench.scenes.journal import SceneJournal
@@ -27,12 +29,18 @@ from persist_cli.bench.scenes.return_part import (
 )
 from persist_cli.bench.scenes.scene_bench import SceneBench, SceneBenchPlan, chosen_files, read_views
 from persist_cli.evaluate.statistics import Draws
-from persist_cli.io.files import read_tensors
+from persist_cli.io.files import read_tensors, write_tensors
 from persist_cli.metrics.fvd import LEAST_FRAMES, LEAST_VIDEOS, Fvd
 from persist_cli.metrics.fvd_pieces import fvd_of_rows, pieces
 from persist_memory.scene.editing import edit_grid
+from tests.conftest import Persist
 from tests.support.cell_houses import TABLE, camera_in, two_rooms, write_cell_houses
 from tests.support.micro_runs import run_persist
+
+SMALL = (
+    "--seeds", 1, "--walks", 1, "--return-steps", 9, "--edits", 3, "--denoising-steps", 1, "--radius", 2,
+    "--memories", "scene,stage1", "--set", "memory.steps=1",
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -43,9 +51,7 @@ def measured(
     out = tmp_path_factory.mktemp("bench") / "rendered"
     options = ("--data", cell_houses, "--parts", "return,edits", "--out", out, "--checkpoint", scene_renderer)
     options = (*options, "--report", out / "report")
-    small = ("--seeds", 1, "--walks", 1, "--return-steps", 9, "--edits", 3, "--denoising-steps", 1, "--radius", 2)
-    words = (scene_model, *options, *small, "--memories", "scene,stage1", "--set", "memory.steps=1")
-    run_persist("bench", "scene", *map(str, words))
+    run_persist("bench", "scene", *map(str, (scene_model, *options, *SMALL)))
     return out
 
 
@@ -82,6 +88,19 @@ def test_a_walk_that_fades_shows_in_the_worst_window_and_in_a_line_that_falls() 
     assert windows[f"1-{WINDOW}"]["psnr"]["mean"] is None  # on the way out there is nothing to compare with
     whole = walk_values(walk | {"seconds": torch.tensor(1.0)}, seen, 4)
     assert windows[f"{WINDOW + 1}-{2 * WINDOW}"]["psnr"]["mean"] == pytest.approx(whole["psnr"])
+
+
+def test_frames_of_an_adapter_that_was_trained_on_are_not_taken_for_those_of_the_new_one(
+    persist: Persist, measured: Path, scene_model: Path, cell_houses: Path, scene_renderer: Path, tmp_path: Path
+) -> None:
+    trained = shutil.copytree(scene_renderer, scene_renderer.with_name(f"{scene_renderer.name}-trained-on"))
+    weights = find_checkpoint(trained).adapter_folder("scene") / "adapter.safetensors"
+    tensors, metadata = read_tensors(weights)
+    write_tensors(weights, {name: tensor + 1 for name, tensor in tensors.items()}, metadata)
+    out = shutil.copytree(measured, tmp_path / "out")
+    options = ("--data", cell_houses, "--parts", "return,edits", "--out", out, "--checkpoint", trained, *SMALL)
+    result = persist("bench", "scene", scene_model, *options)
+    assert "holds 'adapter scene' of another benchmark" in result.err
 
 
 def test_edits_are_rendered_and_counted_by_kind(measured: Path) -> None:
