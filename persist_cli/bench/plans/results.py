@@ -84,6 +84,8 @@ COLUMNS: Final = {
     "open_seconds": Column("s/plan", "lower", False, "seconds that the plan took", "open"),
 }  # fmt: skip
 
+NEED_WEIGHTS: Final = ("sim", "lpips")  # columns of networks whose weights may be fetched later
+
 
 @dataclass(frozen=True)
 class Group:
@@ -230,13 +232,17 @@ def table_json(
 
 
 def row_figures(records: Sequence[Mapping[str, Any]], draws: Draws) -> dict[str, Figure]:
-    """Return the figures of a row by column, of those columns that some episode has."""
+    """Return the figures of a row by column, of those columns that some episode has.
+
+    Figures that need weights are those of all episodes: some may have been run before the weights were fetched.
+    """
     found = {}
     for name, column in COLUMNS.items():
         loops = [record[column.loop] for record in records]
         values = [np.nan if loop is None else loop["figures"].get(name, np.nan) for loop in loops]
         finite = np.array([np.nan if value is None else value for value in values], np.float64)
-        if np.isfinite(finite).any():
+        known = np.isfinite(finite)
+        if known.all() if name in NEED_WEIGHTS else known.any():
             found[name] = mean_figure(finite[None, None], draws)
     return found
 

@@ -39,3 +39,10 @@ def test_rates_are_means_over_episodes_as_their_definitions_say() -> None:
     assert figures["collisions_per_action"].mean == pytest.approx((1 / 2 + 0) / 2)  # not 1 of 102
     for name in (name for name in COLUMNS if name.endswith(("per_action", "per_decision"))):
         assert "mean over episodes" in COLUMNS[name].definition
+
+
+def test_figures_of_weights_that_were_fetched_while_the_benchmark_was_stopped_are_not_those_of_some_episodes() -> None:
+    before, after = {"ate": 1.0}, {"ate": 2.0, "sim": 90.0, "lpips": 0.2}
+    records = [{"closed": None, "open": {"figures": figures}} for figures in (before, after)]
+    assert set(row_figures(records, Draws.of([0, 1]))) == {"ate"}
+    assert set(row_figures([records[1]] * 2, Draws.of([0, 1]))) == {"ate", "sim", "lpips"}
