@@ -11,7 +11,7 @@ from torch import Tensor
 
 from persist_cli.api.ground import Body, GroundMap
 from persist_cli.api.policy import Goal, GoalKind
-from persist_cli.api.promises import check_costs
+from persist_cli.api.promises import check_costs, kept
 from persist_cli.io.settings import NoSettings
 
 
@@ -60,9 +60,10 @@ class Cost(ABC):
         """Return what ``measure`` does, after a check that it is what that promises. Persist asks by this method.
 
         Raises:
-            PluginError: when it is not; NaN may come of imagined frames.
+            PluginError: when it is not, or what is given is changed; NaN may come of imagined frames.
         """
-        costs = self.measure(futures, goal, ground)
+        with kept("cost", self.name, "measure", futures=futures, goal=goal, ground=ground):
+            costs = self.measure(futures, goal, ground)
         check_costs(costs, self.name, tuple(futures.world_from_camera.shape[:2]))
         return costs
 

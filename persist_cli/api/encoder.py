@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from persist_cli.api.promises import check_features
+from persist_cli.api.promises import check_features, kept
 from persist_cli.errors import PluginError
 from persist_cli.io.settings import NoSettings
 
@@ -47,9 +47,9 @@ class Encoder(ABC):
         """Return what ``encode`` does, without gradients and checked. Memories encode by this method.
 
         Raises:
-            PluginError: when it is not what that promises.
+            PluginError: when it is not what that promises, or the images are changed.
         """
-        with torch.no_grad():
+        with torch.no_grad(), kept("encoder", self.name, "encode", rgb=rgb):
             features = self.encode(rgb)
         check_features(features, self.name, self.channels, len(rgb))
         return features

@@ -18,7 +18,7 @@ from persist_cli.api.cameras import Cameras
 from persist_cli.api.encoder import Encoder
 from persist_cli.api.memory_file import FORMAT, FORMAT_VERSION
 from persist_cli.api.observations import Observations, Origin, origins_like
-from persist_cli.api.promises import check_figures, check_points, check_stored, check_tokens
+from persist_cli.api.promises import check_figures, check_points, check_stored, check_tokens, kept
 from persist_cli.api.scene_edits import Edit, EditOutcome
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError, PersistError, PluginError
@@ -111,7 +111,8 @@ class Memory(ABC):
         """Add posed frames in metres of the reference's world; pixels without depth (0) get no position.
 
         ``observations.origins`` says which frames a model imagined. They shall not change what was observed, and an
-        observation shall replace what was imagined of the same place. ``by_origin`` splits the frames.
+        observation shall replace what was imagined of the same place. ``by_origin`` splits the frames. Others read
+        the observations too, so a memory changes clones of them at most.
 
         Raises:
             DataError: when a pose is not finite and rigid, or sizes differ; then nothing is written.
@@ -124,8 +125,11 @@ class Memory(ABC):
 
         Raises:
             DataError: as ``write`` does.
+            PluginError: when it changes what it is given.
         """
-        self.write(observations if self.reads_depth else observations.without_depth())
+        seen = observations if self.reads_depth else observations.without_depth()
+        with kept("memory", self.name, "write", observations=seen):
+            self.write(seen)
 
     def foresee(self, cameras: Sequence[Cameras]) -> None:  # noqa: B027  # most memories imagine nothing
         """Make ready to be read by camera paths; a scene imagines here what they will see and nobody has seen.
@@ -153,10 +157,11 @@ class Memory(ABC):
             together: whether the sample of ``read_together`` may stand for each path, where the memory has one.
 
         Raises:
-            PluginError: when they are not.
+            PluginError: when they are not, or the cameras are changed.
         """
-        of_all = self.read_together(cameras, budget) if together else None
-        read = self.read_batch(cameras, budget) if of_all is None else [of_all] * len(cameras)
+        with kept("memory", self.name, "read", cameras=cameras):
+            of_all = self.read_together(cameras, budget) if together else None
+            read = self.read_batch(cameras, budget) if of_all is None else [of_all] * len(cameras)
         if not isinstance(read, Sequence) or len(read) != len(cameras):
             given = f"{len(read)} samples" if isinstance(read, Sequence) else f"a {type(read).__name__}"
             raise PluginError(f"memory {self.name!r}: read_batch gave {given} for {len(cameras)} paths")

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from persist_cli.api.ground import GroundMap
 from persist_cli.api.observations import Observations, TrajectoryInfo
-from persist_cli.api.promises import check_proposals
+from persist_cli.api.promises import check_proposals, kept
 from persist_cli.io.settings import NoSettings
 
 if TYPE_CHECKING:
@@ -86,9 +86,10 @@ class Policy(ABC):
         """Return what ``propose`` does, after a check that it is what that promises. Persist asks by this method.
 
         Raises:
-            PluginError: when it is not.
+            PluginError: when it is not, or the situation is changed.
         """
-        proposed = self.propose(situation, horizon, count, generator)
+        with kept("policy", self.name, "propose", situation=situation):
+            proposed = self.propose(situation, horizon, count, generator)
         check_proposals(proposed, self.name, situation.info.vocabulary.names, horizon, count)
         return [tuple(names) for names in proposed]
 

@@ -6,8 +6,10 @@ go on as a black frame, a map that cannot be read again, or an error far from it
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import torch
@@ -30,6 +32,46 @@ TOKEN_PARTS: Final[dict[str, tuple[torch.dtype, tuple[int | None, ...]]]] = {  #
     "world_from_camera": (torch.float64, (4, 4)),
     "intrinsics": (torch.float64, (3, 3)),
 }
+
+
+@contextlib.contextmanager
+def kept(kind: str, name: str, method: str, **given: Any) -> Iterator[None]:
+    """Within the block runs a method of a plugin, which must leave the tensors that it is given as they are.
+
+    Others read them after it: they are the truth of a prediction, or the goal of every round of a plan. A change by
+    NumPy is not noticed.
+
+    Args:
+        kind: kind of the plugin.
+        name: its name.
+        method: the method's name.
+        given: the method's arguments.
+
+    Raises:
+        PluginError: when one has changed.
+    """
+    versions = [
+        (place, tensor, tensor._version) for place, tensor in _tensors_in(given, "") if not tensor.is_inference()
+    ]
+    yield
+    for place, tensor, version in versions:
+        if tensor._version != version:
+            raise _broken(kind, name, f"{method} changed {place}, which it was given; it may change a clone of it")
+
+
+def _tensors_in(values: Any, place: str) -> Iterator[tuple[str, Tensor]]:
+    """All tensors in arguments, with their names as Python has them."""
+    if isinstance(values, Tensor):
+        yield place, values
+    elif isinstance(values, Mapping):
+        for name, value in values.items():
+            yield from _tensors_in(value, str(name))
+    elif isinstance(values, list | tuple):
+        for number, value in enumerate(values):
+            yield from _tensors_in(value, f"{place}[{number}]")
+    elif dataclasses.is_dataclass(values):
+        for field in dataclasses.fields(values):
+            yield from _tensors_in(getattr(values, field.name), f"{place}.{field.name}")
 
 
 def check_tokens(tokens: Any, memory: str, channels: int, budget: int) -> None:

@@ -4,11 +4,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
+from persist_cli.api.actions import walking_actions
+from persist_cli.api.cameras import Cameras
+from persist_cli.api.cost import Cost, Futures
 from persist_cli.api.encoder import Encoder
-from persist_cli.api.memory import MapPoints, MemoryFigures
+from persist_cli.api.ground import GroundMap
+from persist_cli.api.memory import FrameOfReference, MapPoints, Memory, MemoryFigures
+from persist_cli.api.observations import Observations, TrajectoryInfo
+from persist_cli.api.policy import Goal, Policy, Situation
 from persist_cli.api.promises import (
     check_costs,
     check_features,
@@ -203,3 +210,60 @@ def test_proposals_that_no_policy_promises_name_the_policy(proposed, cause):
 def test_costs_that_no_cost_promises_name_the_cost(costs):
     with pytest.raises(PluginError, match=r"^cost 'far': measure gave .*, not float \[3, 2\]"):
         check_costs(costs, "far", (3, 2))
+
+
+class Careless(Memory):
+    """A memory that changes what it is given, by a method of a name."""
+
+    def write(self, observations):
+        observations.rgb[0].zero_()
+
+    def read(self, cameras, budget):
+        cameras.world_from_camera[:, :3, 3] -= 1
+        return MemoryTokens.empty(3)
+
+    def tensors(self):
+        return {}
+
+    def restore(self, tensors):
+        pass
+
+
+class CarelessEncoder(Encoder):
+    channels = 3
+
+    def encode(self, rgb):
+        return rgb.copy_(rgb.flip(0)).float()
+
+
+class CarelessCost(Cost):
+    def measure(self, futures, goal, ground):
+        goal.rgb.mul_(0)
+        return torch.zeros(futures.free.shape)
+
+
+class CarelessPolicy(Policy):
+    def propose(self, situation, horizon, count, generator):
+        situation.seen.depth.clamp_(max=1)
+        return [()] * count
+
+
+def test_methods_that_change_what_they_are_given_are_named():
+    cameras = Cameras(torch.eye(4).expand(2, 4, 4).clone(), torch.eye(3).expand(2, 3, 3).clone(), 4, 4)
+    seen = Observations(torch.ones(2, 4, 4, 3, dtype=torch.uint8), torch.ones(2, 4, 4), cameras)
+    goal, ground = Goal(seen.rgb[0].clone(), None, "house"), GroundMap.empty((0.0, -1.0, 0.0))
+    memory = Careless(NoSettings(), CarelessEncoder(NoSettings()), FrameOfReference("house"))
+    futures = Futures(seen.rgb[None], seen.depth[None], cameras.world_from_camera[None], torch.ones(1, 2) > 0)
+    info = TrajectoryInfo("house", np.eye(3), 4, 4, (0.0, -1.0, 0.0), walking_actions(0.25, 15.0))
+    cases = {
+        "write changed observations.rgb": lambda: memory.memorize(seen),
+        r"read changed cameras\[0\].world_from_camera": lambda: memory.recall([cameras], 4),
+        "encode changed rgb": lambda: memory.encoder.encoded(seen.rgb),
+        "measure changed goal.rgb": lambda: CarelessCost(NoSettings()).measured(futures, goal, ground),
+        "propose changed situation.seen.depth": lambda: CarelessPolicy(NoSettings()).proposals(
+            Situation(seen, info, goal, ground), 2, 1, torch.Generator()
+        ),
+    }
+    for cause, call in cases.items():
+        with pytest.raises(PluginError, match=f"{cause}, which it was given; it may change a clone"):
+            call()
