@@ -11,6 +11,7 @@ import dataclasses
 import importlib
 import inspect
 import json
+import re
 import sys
 from collections.abc import Iterator, Set
 from dataclasses import dataclass
@@ -52,6 +53,10 @@ KINDS: Final = {
     "cost": PluginKind("persist.costs", "persist_cli.api.cost:Cost", ("settings",)),
     "scene model": PluginKind("persist.scene_models", "persist_cli.api.scene_model:SceneModel", ("settings",)),
 }
+
+NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")  # it names folders, and stands in lists with commas
+
+RESERVED: Final = {"memory": ("stage1", "simulator")}  # words for what stands among memories in tables
 
 OWN: Final = ("persist_cli", "persist_backbones", "persist_memory")  # packages whose errors are bugs of ours
 
@@ -125,7 +130,9 @@ def find_plugin(kind: str, name: str) -> Plugin:
         raise PluginError(f"unknown {kind} {name!r}; {hint(name, names, 'installed')}")
     if len(plugins) > 1:
         packages = " and ".join(plugin.package for plugin in plugins)
-        raise PluginError(f"{kind} {name!r} is claimed by {packages}; uninstall one of them")
+        others = [plugin.package for plugin in plugins if plugin.module not in OWN]
+        superfluous = others[0] if len(others) == 1 else "all but one of them"
+        raise PluginError(f"{kind} {name!r} is claimed by {packages}; uninstall {superfluous}")
     return plugins[0]
 
 
@@ -159,11 +166,11 @@ def import_plugin(plugin: Plugin) -> type[Any]:
         PluginError: when that fails, or the class is not of the plugin's kind.
     """
     base = _resolve(KINDS[plugin.kind].base)
-    if not plugin.target.partition(":")[2]:
-        cause = "its entry point names no class; write module:class"
+    if cause := _wrong_entry(plugin):
         raise plugin.error(f"is broken: {cause}", cause)
     try:
-        loaded = _resolve(plugin.target)
+        with contextlib.redirect_stdout(sys.stderr):  # standard output is for what the command prints
+            loaded = _resolve(plugin.target)
     except (Exception, SystemExit) as error:  # the module of another package may raise anything
         raise plugin.error(f"is broken: {first_line(error)}", first_line(error)) from error
     cause = _flaw(loaded, base, KINDS[plugin.kind])
@@ -175,6 +182,15 @@ def import_plugin(plugin: Plugin) -> type[Any]:
         raise plugin.error(f"is broken: {cause}", cause)
     loaded.name = plugin.name
     return loaded  # type: ignore[no-any-return]
+
+
+def _wrong_entry(plugin: Plugin) -> str:
+    """Why an entry point can name no plugin, empty when it can."""
+    if not plugin.target.partition(":")[2]:
+        return "its entry point names no class; write module:class"
+    if not NAME.fullmatch(plugin.name):
+        return "a name has letters, digits, '.', '_' and '-', a letter or digit first"
+    return "its name has another meaning; choose another" if plugin.name in RESERVED.get(plugin.kind, ()) else ""
 
 
 def _flaw(loaded: Any, base: type, kind: PluginKind) -> str:

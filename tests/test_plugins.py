@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import textwrap
 
 import pytest
 
@@ -353,9 +354,25 @@ def test_an_exception_in_a_simulator_comes_back_from_its_process_in_one_line(per
 
 def test_a_name_that_two_packages_claim_is_an_error_that_names_both(persist, site):
     install(site, "persist-other", "persist.memories", "voxel = other_voxel:Voxel", "")
-    with pytest.raises(PluginError, match="memory 'voxel' is claimed by persist-cli and persist-other"):
+    claimed = "^memory 'voxel' is claimed by persist-cli and persist-other; uninstall persist-other$"
+    with pytest.raises(PluginError, match=claimed):
         load_plugin("memory", "voxel")
     assert "claimed by 2 packages" in persist("plugins").out
+
+
+@pytest.mark.parametrize("name", ["l/slash", "one,two", "two words", ".hidden", "stage1", "simulator"])
+def test_a_name_that_cannot_be_a_folder_or_means_something_else_is_refused(site, name):
+    install(site, "persist-last", "persist.memories", f"{name} = named_frame:LastFrame", LAST_FRAME)
+    with pytest.raises(PluginError, match=r"is broken: (a|its) name has"):
+        load_plugin("memory", name)
+
+
+def test_what_a_plugin_prints_when_it_is_imported_is_not_the_output_of_the_command(persist, site):
+    code = "print('noise')\n" + textwrap.dedent(LAST_FRAME)
+    install(site, "persist-last", "persist.memories", "last = noisy_frame:LastFrame", code)
+    shown = persist("plugins", "--json")
+    assert {row["name"]: row for row in json.loads(shown.out)}["last"]["state"] == "ok"
+    assert "noise" in shown.err
 
 
 def test_an_entry_point_of_a_misspelt_group_is_shown_and_named(persist, site):
