@@ -353,7 +353,11 @@ def make_importer(name: str, settings: dict[str, Any]) -> Importer:
 
 def make_policy(name: str, settings: dict[str, Any]) -> Policy:
     """Make the policy of a name with plain settings."""
-    return _make("policy", name, settings)  # type: ignore[no-any-return]
+    from persist_cli.api.promises import check_policy
+
+    policy: Policy = _make("policy", name, settings)
+    check_policy(policy)
+    return policy
 
 
 def network_type(policy: str) -> type[PolicyNetwork]:
@@ -375,7 +379,13 @@ def make_cost(name: str, settings: dict[str, Any]) -> Cost:
 
 def make_scene_model(name: str, settings: dict[str, Any]) -> SceneModel:
     """Make the model of scenes of a name with plain settings and fresh weights."""
-    return _make("scene model", name, settings)  # type: ignore[no-any-return]
+    from persist_cli.api.scene_model import SceneForm
+
+    model: SceneModel = _make("scene model", name, settings)
+    if not isinstance(model.form, SceneForm):
+        cause = f"its form is a {type(model.form).__name__}, no SceneForm"
+        raise find_plugin("scene model", name).error(f"is broken: {cause}", cause)
+    return model
 
 
 def make_settings(kind: str, name: str, settings: dict[str, Any]) -> Any:

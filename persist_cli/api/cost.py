@@ -12,6 +12,7 @@ from torch import Tensor
 from persist_cli.api.ground import Body, GroundMap
 from persist_cli.api.policy import Goal, GoalKind
 from persist_cli.api.promises import check_costs, kept
+from persist_cli.errors import PluginError
 from persist_cli.io.settings import NoSettings
 
 
@@ -55,6 +56,17 @@ class Cost(ABC):
     def of_body(self, body: Body) -> Cost:
         """Return the cost of an agent with a body; the same unless the cost measures where the body fits."""
         return self
+
+    def fitted(self, body: Body) -> Cost:
+        """Return what ``of_body`` does, after a check that it is a cost. Persist fits costs by this method.
+
+        Raises:
+            PluginError: when it is not.
+        """
+        fitted: Any = self.of_body(body)
+        if not isinstance(fitted, Cost):
+            raise PluginError(f"cost {self.name!r}: of_body gave {type(fitted).__name__}; it must return a cost")
+        return fitted
 
     def measured(self, futures: Futures, goal: Goal, ground: GroundMap) -> Float[Tensor, "candidate frame"]:
         """Return what ``measure`` does, after a check that it is what that promises. Persist asks by this method.

@@ -13,11 +13,13 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from persist_cli.api.cells import CellOrigin
 from persist_cli.api.observations import Origin
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import PluginError
+from persist_cli.io.files import SAFETENSORS_TYPES
 
 LOGGED: Final = ("step", "seconds", "learning_rate")  # of each step of a training, in its log
 
@@ -126,10 +128,13 @@ def check_stored(tensors: Any, memory: str, reserved: str) -> None:
     if not isinstance(tensors, Mapping):
         raise _broken("memory", memory, f"tensors gave {_kind(tensors)}, not tensors by name")
     for name, tensor in tensors.items():
-        if not isinstance(name, str) or name.startswith(reserved):
-            raise _broken("memory", memory, f"tensors gave a name {name!r}; no name begins with {reserved!r}")
+        if not isinstance(name, str) or name.startswith((reserved, "__")):
+            raise _broken("memory", memory, f"tensors gave a name {name!r}; no name begins with {reserved!r} or '__'")
         if not isinstance(tensor, Tensor) or not tensor.ndim or tensor.is_complex():
             raise _broken("memory", memory, f"tensors gave {name} as {_kind(tensor)}, not a tensor of items")
+        kind = str(tensor.dtype).removeprefix("torch.")
+        if tensor.is_meta or tensor.layout != torch.strided or kind not in SAFETENSORS_TYPES:
+            raise _broken("memory", memory, f"tensors gave {name}, whose values a safetensors file cannot hold")
 
 
 def check_points(points: Any, memory: str) -> None:
@@ -151,6 +156,11 @@ def check_points(points: Any, memory: str) -> None:
         raise _broken("memory", memory, f"points gave origins as {_kind(origins)}, not uint8 [{len(positions)}]")
     if not is_finite(positions):
         raise _broken("memory", memory, "points gave positions that are not finite")
+    if len(positions) and int(points.origins.amax()) > max(CellOrigin):
+        raise _broken("memory", memory, f"points gave origins beyond {int(max(CellOrigin))}")
+    spread, rise = points.spread, points.rise
+    if not (_is_length(spread) and math.isfinite(spread) and _is_length(rise)):
+        raise _broken("memory", memory, f"points gave the spread {spread!r} and the rise {rise!r}, not metres")
 
 
 def check_figures(figures: Any, memory: str) -> None:
@@ -165,6 +175,13 @@ def check_figures(figures: Any, memory: str) -> None:
     cells, imagined = figures.cells, figures.imagined
     if not all(isinstance(count, int) for count in (cells, imagined)) or not 0 <= imagined <= cells:
         raise _broken("memory", memory, f"figures gave {imagined!r} imagined of {cells!r} items")
+    size, bounds = figures.bytes, figures.bounds
+    if not isinstance(size, int) or size < 0:
+        raise _broken("memory", memory, f"figures gave {size!r} bytes")
+    if bounds is not None and not (
+        isinstance(bounds, tuple | list) and len(bounds) == 2 and all(map(_is_place, bounds))
+    ):
+        raise _broken("memory", memory, f"figures gave the bounds {bounds!r}, not two corners in metres")
 
 
 def check_features(features: Any, encoder: str, channels: Any, frames: int) -> None:
@@ -183,7 +200,7 @@ def check_features(features: Any, encoder: str, channels: Any, frames: int) -> N
     if len(features) != frames or features.shape[3] != channels or not features[0].numel():
         wanted = f"{frames} frames of [rows, columns, {channels}]"
         raise _broken("encoder", encoder, f"encode gave {_kind(features)}, not {wanted}")
-    if not is_finite(features):
+    if features.is_meta or not is_finite(features):
         raise _broken("encoder", encoder, "encode gave features that are not finite")
 
 
@@ -204,6 +221,33 @@ def check_generated(images: Any, backbone: str, shape: tuple[int, ...]) -> None:
         raise _broken("backbone", backbone, f"gave depth as {_kind(depth)}, not float {_shape(shape)}")
     if not is_finite(depth) or bool((depth < 0).any()):
         raise _broken("backbone", backbone, "gave depth that is negative or not finite")
+
+
+def check_cells(cells: Any, model: str, method: str, shape: tuple[int, ...], classes: int) -> None:
+    """Raise ``PluginError`` when the cells of a scene model are not what its methods promise.
+
+    Args:
+        cells: what the model returned: classes, and colours.
+        model: its name.
+        method: that returned them.
+        shape: windows, and cells of each along the two ground axes and up.
+        classes: number of classes of the model's palette.
+    """
+    if not isinstance(cells, tuple | list) or len(cells) != 2:
+        raise _broken("scene model", model, f"{method} gave {_kind(cells)}, not classes and colours")
+    for part, values, wanted in zip(("classes", "colours"), cells, (shape, (*shape, 3)), strict=True):
+        if not _is_of(values, torch.uint8, wanted):
+            raise _broken("scene model", model, f"{method} gave {part} as {_kind(values)}, not uint8 {_shape(wanted)}")
+    if int(cells[0].amax()) >= classes:
+        raise _broken("scene model", model, f"{method} gave the class {int(cells[0].amax())} of {classes} classes")
+
+
+def check_policy(policy: Any) -> None:
+    """Raise ``PluginError`` when a policy needs no number of frames, or looks no number of actions ahead."""
+    for member, value, lacking in (("frames", policy.frames, False), ("longest", policy.longest, True)):
+        if not (lacking and value is None) and not (isinstance(value, int) and value >= 1):
+            wanted = f"a number from 1 on{', or None' if lacking else ''}"
+            raise _broken("policy", policy.name, f"its {member} is {value!r}, not {wanted}")
 
 
 def check_proposals(proposed: Any, policy: str, known: Collection[str], horizon: int, count: int) -> None:
@@ -241,6 +285,19 @@ def check_costs(costs: Any, cost: str, shape: tuple[int, ...]) -> None:
         raise _broken("cost", cost, f"measure gave {_kind(costs)}, not float {_shape(shape)}")
 
 
+def check_parameters(parameters: Any, model: str) -> None:
+    """Raise ``PluginError`` when a model does not say which of its parameters are trained, or none is.
+
+    Args:
+        parameters: what ``trained_parameters`` returned.
+        model: the name of the model's class.
+    """
+    if not isinstance(parameters, Mapping) or not all(isinstance(one, nn.Parameter) for one in parameters.values()):
+        raise PluginError(f"{model}: trained_parameters gave {_kind(parameters)}, not parameters by name")
+    if not parameters:
+        raise PluginError(f"{model}: trained_parameters gave none; there is nothing to train in this stage")
+
+
 def check_losses(losses: Any, model: str) -> None:
     """Raise ``PluginError`` when a model's ``forward`` does not give scalar tensors by name, ``loss`` among them.
 
@@ -264,6 +321,17 @@ def is_finite(values: Tensor) -> bool:
     """Whether all of many numbers are finite; those without content are. A sum tells it soonest."""
     wide = torch.promote_types(values.dtype, torch.float32)  # a sum in half precision ends at 65504
     return values.is_meta or math.isfinite(float(values.sum(dtype=wide)))
+
+
+def _is_length(value: Any) -> bool:
+    """Whether something is a number of metres, 0 and infinity among them."""
+    return isinstance(value, float | int) and value >= 0
+
+
+def _is_place(value: Any) -> bool:
+    """Whether something is three finite numbers."""
+    is_triple = isinstance(value, tuple | list) and len(value) == 3
+    return is_triple and all(isinstance(part, float | int) and math.isfinite(part) for part in value)
 
 
 def _is_of(value: Any, dtype: torch.dtype, shape: tuple[int | None, ...]) -> bool:

@@ -166,7 +166,7 @@ class Navigator:
     ) -> None:
         self.info, self.seed = scene.info, scene.episode.seed
         body = body_of(self.info)
-        cost = None if parts.cost is None else parts.cost.of_body(body)
+        cost = None if parts.cost is None else parts.cost.fitted(body)
         self.row, self.parts, self.settings = row, replace(parts, cost=cost), settings
         self.seen = scene.look()
         self.looked = [self.seen.cameras.world_from_camera.double().cpu()]

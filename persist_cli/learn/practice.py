@@ -138,7 +138,7 @@ class Walker:
         self.mapper = None if ground is None else ground.copy()
         self.info, self.body, self.views, self.settings = place.info, place.body, views, settings
         self.policy, self.explorer = policies
-        self.cost = make_cost("geodesic", {}).of_body(self.body or Body())
+        self.cost = make_cost("geodesic", {}).fitted(self.body or Body())
         self.random = np.random.default_rng(seed)
         self.generator = torch.Generator().manual_seed(int(self.random.integers(2**62)))
         self.sampling_seed = int(self.random.integers(SEEDS))

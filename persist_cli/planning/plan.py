@@ -152,7 +152,7 @@ def plan_parts(options: PlanOptions) -> PlanParts:
     action_names(vocabulary, options.actions)
     goal = read_goal(options.goal, start.observations, start.info)
     name = options.cost or ("lpips" if goal.rgb is not None else "geodesic")
-    cost = make_cost(name, settings["cost"]).of_body(body_of(start.info))
+    cost = make_cost(name, settings["cost"]).fitted(body_of(start.info))
     check_goal(goal, cost, policy)
     first = max(0, reference.frame + 1 - (policy.frames if policy is not None else 1))
     seen = file.read(range(first, reference.frame + 1)).observations

@@ -20,7 +20,7 @@ from accelerate import Accelerator
 from torch import nn
 from torch.utils.data import DataLoader, Dataset
 
-from persist_cli.api.promises import check_losses
+from persist_cli.api.promises import check_losses, check_parameters
 from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.checkpoints.lineage import Lineage
 from persist_cli.data.clips import DistributedBatches
@@ -127,6 +127,7 @@ class TrainingLoop(ABC, Generic[Model]):
             parameters: those that are trained, by name.
             opponent: what the model is trained against, if anything; its parameters are among the others.
         """
+        check_parameters(parameters, type(model).__name__)
         self.whole, settings = model, self.recipe.training
         optimizer = make_optimizer(parameters.values(), settings, opponent)
         self.sharding = self.make_sharding()

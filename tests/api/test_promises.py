@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,17 +14,20 @@ from persist_cli.api.actions import walking_actions
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.cost import Cost, Futures
 from persist_cli.api.encoder import Encoder
-from persist_cli.api.ground import GroundMap
+from persist_cli.api.ground import Body, GroundMap
 from persist_cli.api.memory import FrameOfReference, MapPoints, Memory, MemoryFigures
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.api.policy import Goal, Policy, Situation
 from persist_cli.api.promises import (
+    check_cells,
     check_costs,
     check_features,
     check_figures,
     check_generated,
     check_losses,
+    check_parameters,
     check_points,
+    check_policy,
     check_proposals,
     check_stored,
     check_tokens,
@@ -33,6 +38,7 @@ from persist_cli.io.settings import NoSettings
 
 TOKENS = MemoryTokens.of(torch.ones(5, 32), torch.ones(5, 3), torch.zeros(5, 3, dtype=torch.uint8))
 LOSS = torch.ones(3, requires_grad=True)
+CLASSES, COLORS = (torch.zeros(1, 2, 2, 3, *rest, dtype=torch.uint8) for rest in ((), (3,)))
 
 
 def changed(**parts: object) -> MemoryTokens:
@@ -80,6 +86,7 @@ def test_tokens_as_promised_pass(tokens):
         (torch.zeros(2, 4, 3, 3), 4, r"float32 \[2, 4, 3, 3\], not 2 frames"),
         (torch.zeros(2, 0, 3, 4), 4, r"float32 \[2, 0, 3, 4\], not 2 frames"),
         (torch.full((2, 3, 3, 4), torch.nan), 4, "features that are not finite"),
+        (torch.zeros(2, 3, 3, 4, device="meta"), 4, "features that are not finite"),
         (torch.zeros(2, 3, 3, 4), 4.0, "its channels are 4.0, not a number from 1 on"),
         (torch.zeros(2, 3, 3, 4), None, "its channels are None"),
     ],
@@ -147,6 +154,9 @@ def test_losses_that_cannot_be_trained_on_name_the_model(losses, cause):
         ({"cells": torch.ones(())}, r"cells as float32 \[\]"),
         ({"cells": torch.ones(3).numpy()}, "cells as a ndarray"),
         ({"cells": torch.ones(3, dtype=torch.complex64)}, "cells as complex64"),
+        ({"cells": torch.ones(3, device="meta")}, "cells, whose values a safetensors file cannot hold"),
+        ({"cells": torch.ones(3).to_sparse()}, "cells, whose values a safetensors file cannot hold"),
+        ({"__metadata__": torch.ones(3)}, "a name '__metadata__'"),
     ],
 )
 def test_what_can_be_no_memory_file_names_the_memory(tensors, cause):
@@ -173,6 +183,38 @@ def test_points_of_another_kind_or_with_other_origins_name_the_memory():
         check_points((positions, colors), "last")
     with pytest.raises(PluginError, match=r"^memory 'last': points gave origins as uint8 \[1\], not uint8 \[4\]"):
         check_points(MapPoints(positions, colors, origins=torch.ones(1, dtype=torch.uint8)), "last")
+
+
+@pytest.mark.parametrize(
+    ("parts", "cause"),
+    [
+        ({"spread": math.nan}, "the spread nan"),
+        ({"spread": "a"}, "the spread 'a'"),
+        ({"spread": math.inf}, "the spread inf"),
+        ({"rise": -1.0}, "the spread 0.05 and the rise -1.0, not metres"),
+        ({"origins": torch.full((4,), 9, dtype=torch.uint8)}, "origins beyond 3"),
+    ],
+)
+def test_points_of_no_size_or_of_unknown_origin_name_the_memory(parts, cause):
+    points = MapPoints(torch.ones(4, 3), torch.zeros(4, 3, dtype=torch.uint8), **parts)
+    with pytest.raises(PluginError, match=f"^memory 'last': points gave {cause}"):
+        check_points(points, "last")
+
+
+@pytest.mark.parametrize(
+    ("size", "bounds", "cause"),
+    [
+        (None, None, "None bytes"),
+        (math.nan, None, "nan bytes"),
+        (3, 3, "the bounds 3, not two corners in metres"),
+        (3, ("abc", "def"), r"the bounds \('abc', 'def'\)"),
+        (3, ((0.0, 0.0), (1.0, 1.0)), "the bounds"),
+        (3, ((0.0, 0.0, math.nan), (1.0, 1.0, 1.0)), "the bounds"),
+    ],
+)
+def test_sizes_and_bounds_that_are_no_numbers_name_the_memory(size, bounds, cause):
+    with pytest.raises(PluginError, match=f"^memory 'last': figures gave {cause}"):
+        check_figures(MemoryFigures(3, size, bounds, 0), "last")
 
 
 @pytest.mark.parametrize(("cells", "imagined"), [(3, 5), (3, -1), (3.5, 0), (torch.tensor(3), 0), (None, 0)])
@@ -210,6 +252,59 @@ def test_proposals_that_no_policy_promises_name_the_policy(proposed, cause):
 def test_costs_that_no_cost_promises_name_the_cost(costs):
     with pytest.raises(PluginError, match=r"^cost 'far': measure gave .*, not float \[3, 2\]"):
         check_costs(costs, "far", (3, 2))
+
+
+@pytest.mark.parametrize(
+    ("cells", "cause"),
+    [
+        (None, "sample gave None, not classes and colours"),
+        ((CLASSES,), "sample gave a tuple, not classes and colours"),
+        ((CLASSES.float(), COLORS), r"classes as float32 \[1, 2, 2, 3\], not uint8 \[1, 2, 2, 3\]"),
+        ((CLASSES, COLORS[..., 0]), r"colours as uint8 \[1, 2, 2, 3\], not uint8 \[1, 2, 2, 3, 3\]"),
+        ((CLASSES + 7, COLORS), "sample gave the class 7 of 3 classes"),
+    ],
+)
+def test_cells_that_no_scene_model_promises_name_the_model(cells, cause):
+    with pytest.raises(PluginError, match=f"^scene model 'rooms': .*{cause}"):
+        check_cells(cells, "rooms", "sample", (1, 2, 2, 3), 3)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "cause"),
+    [
+        (None, "None, not parameters by name"),
+        ({"weight": torch.ones(3)}, "a dict, not parameters by name"),
+        ({}, "none; there is nothing to train in this stage"),
+    ],
+)
+def test_parameters_that_cannot_be_trained_name_the_model(parameters, cause):
+    with pytest.raises(PluginError, match=f"^Toy: trained_parameters gave {cause}"):
+        check_parameters(parameters, "Toy")
+
+
+@pytest.mark.parametrize(
+    ("frames", "longest", "cause"),
+    [
+        ("2", None, "its frames is '2', not a number from 1 on"),
+        (0, None, "its frames is 0"),
+        (1, "a", "its longest is 'a', not a number from 1 on, or None"),
+        (1, 0, "its longest is 0"),
+    ],
+)
+def test_a_policy_that_looks_nowhere_is_named(frames, longest, cause):
+    with pytest.raises(PluginError, match=f"^policy 'mine': {cause}"):
+        check_policy(SimpleNamespace(name="mine", frames=frames, longest=longest))
+
+
+def test_a_cost_that_fits_no_body_is_named():
+    class Lost(CarelessCost):
+        name = "lost"
+
+        def of_body(self, body):
+            pass
+
+    with pytest.raises(PluginError, match=r"^cost 'lost': of_body gave NoneType; it must return a cost"):
+        Lost(NoSettings()).fitted(Body())
 
 
 class Careless(Memory):

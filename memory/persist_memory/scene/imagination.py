@@ -18,6 +18,7 @@ from persist_cli.api.cameras import Cameras
 from persist_cli.api.cell_rays import first_surfaces, sheet_cells
 from persist_cli.api.cells import SOLID, CellGrid, CellOrigin
 from persist_cli.api.geometry import unproject
+from persist_cli.api.promises import check_cells
 from persist_cli.api.reach import cells_in_reach
 from persist_cli.api.scene_model import Given, SceneForm, SceneModel, SceneSamples, no_view, window_pose
 from persist_cli.api.scene_turns import Turn
@@ -171,6 +172,7 @@ class Imagination:
         with torch.inference_mode():
             drawn = self.model.sample(sample, self.steps)
         here = window.classes.device
+        self._check(drawn, "sample")
         classes, colors = (turned.back(part[0]).to(here) for part in drawn)
         return classes.clone(), colors.clone()
 
@@ -192,6 +194,7 @@ class Imagination:
             said = self.model.outcome(sample)
         if said is None:
             return None
+        self._check(said, "outcome")
         classes, colors = (turned.back(part[0]).to(window.classes.device).clone() for part in said)
         return replace(window, classes=classes, colors=colors)
 
@@ -223,6 +226,11 @@ class Imagination:
         )  # fmt: skip
         return turned, SceneSamples.stack([sample.to("cpu")]).to(self.device)
 
+    def _check(self, cells: object, method: str) -> None:
+        """Raise ``PluginError`` when cells of one window, which a method of the model gave, are none."""
+        form = self.model.form
+        check_cells(cells, self.model.name, method, (1, *form.shape), len(form.cells.palette))
+
     @property
     def device(self) -> torch.device:
         """Where the model is."""
@@ -242,6 +250,7 @@ class Imagination:
         told = (turned.cells(part)[None].to(self.device) for part in (classes, colors))
         with torch.inference_mode():
             held = self.model.reconstruct(*told)
+        self._check(held, "reconstruct")
         classes, colors = (turned.back(part[0]).to(window.classes.device).clone() for part in held)
         return replace(window, classes=classes, colors=colors)
 

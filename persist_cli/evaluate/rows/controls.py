@@ -16,6 +16,7 @@ from persist_cli.api.cameras import Cameras
 from persist_cli.api.checkpoint import Checkpoint
 from persist_cli.api.geometry import pose_differences
 from persist_cli.api.observations import Observations
+from persist_cli.api.promises import check_generated
 from persist_cli.evaluate.cases import CaseFrames
 from persist_cli.evaluate.coverage import held_frames
 from persist_cli.evaluate.rows.interventions import NoisyPoses
@@ -85,7 +86,10 @@ class CodecReconstruction(Control):
         depth = [torch.stack([truth.depth[:1] for truth in truths])]
         for first in range(0, len(truths[0]) - 1, length):
             count = min(length, len(truths[0]) - 1 - first)
-            colors, metres = backbone.reconstruct(Clips.stack([cut_clip(truth, first, length) for truth in truths]))
+            given = Clips.stack([cut_clip(truth, first, length) for truth in truths])
+            images = backbone.reconstruct(given)
+            check_generated(images, backbone.name, tuple(given.depth.shape))
+            colors, metres = images
             rgb.append(colors[:, 1 : count + 1].cpu())
             depth.append(metres[:, 1 : count + 1].cpu())
         return torch.cat(rgb, dim=1), torch.cat(depth, dim=1)
