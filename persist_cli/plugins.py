@@ -396,14 +396,19 @@ def make_settings(kind: str, name: str, settings: dict[str, Any]) -> Any:
     """
     from persist_cli.io.settings import parse_settings
 
-    kind_of_settings = load_plugin(kind, name).settings_type
+    kind_of_settings, where = load_plugin(kind, name).settings_type, f"{kind} {name!r}"
     try:
-        made = parse_settings(kind_of_settings, settings, f"{kind} {name!r}")
-        json.dumps(dataclasses.asdict(made))  # as in cards and memory files
+        made = parse_settings(kind_of_settings, settings, where)
+        kept = json.loads(json.dumps(dataclasses.asdict(made)))  # as in cards and memory files
     except PersistError:
         raise
     except Exception as error:  # what pydantic cannot read, or what JSON cannot hold
         cause = f"its settings cannot be used: {first_line(error)}"
+        raise find_plugin(kind, name).error(f"is broken: {cause}", cause) from error
+    try:
+        parse_settings(kind_of_settings, kept, where)
+    except RecipeError as error:  # defaults are not checked when settings are made
+        cause = f"its settings cannot be read again: {str(error).removeprefix(f'{where}: ')}"
         raise find_plugin(kind, name).error(f"is broken: {cause}", cause) from error
     return made
 

@@ -133,6 +133,7 @@ SETTINGS = """
     [
         ("Colour", "Colour.RED", "not JSON serializable"),
         ("torch.dtype", "torch.float32", "its settings cannot be used"),
+        ("int", "'x'", "its settings cannot be read again: value must be a whole number, not 'x'"),
     ],
 )
 def test_settings_that_nothing_can_keep_are_refused_before_any_work(persist, site, walks, kind, value, cause):
@@ -142,6 +143,16 @@ def test_settings_that_nothing_can_keep_are_refused_before_any_work(persist, sit
     assert (ended.code, len(ended.err.splitlines()), (site / "m.safetensors").exists()) == (1, 1, False)
     assert "encoder 'mine' (persist-mine 1.2, " in ended.err
     assert cause in ended.err
+    rows = {row["name"]: row for row in json.loads(persist("plugins", "--json").out)}
+    assert cause in rows["mine"]["state"]
+
+
+def test_settings_of_an_unknown_type_are_one_line_where_a_recipe_is_shown(persist, site, tmp_path):
+    install(site, "persist-mine", "persist.encoders", "mine = mine_ahead:Mine", SETTINGS.format(kind="'Later'", value=3))
+    (tmp_path / "a.yaml").write_text("extends: tiny-stage2-voxel\nmemory: {encoder: mine}\n")
+    ended = persist("recipes", tmp_path / "a.yaml")
+    assert (ended.code, len(ended.err.splitlines())) == (1, 1)
+    assert "mine_ahead:Mine) is broken: its settings cannot be used: " in ended.err
 
 
 def test_two_names_of_one_class_are_refused(site):

@@ -17,10 +17,9 @@ from persist_cli.api.scene import Scene
 from persist_cli.checkpoints.load import adapter_memory
 from persist_cli.data.clips import ClipSample
 from persist_cli.errors import PersistError, RecipeError
-from persist_cli.io.settings import parse_settings
 from persist_cli.memorize.imagining import with_scene_model
 from persist_cli.memorize.kept_features import KeptFeatures
-from persist_cli.plugins import load_plugin, make_encoder
+from persist_cli.plugins import load_plugin, make_encoder, make_settings
 from persist_cli.recipe import MemoryConfig
 
 if TYPE_CHECKING:
@@ -52,7 +51,7 @@ class MemoryFactory:
     def of(config: MemoryConfig, device: torch.device | str = "cpu") -> MemoryFactory:
         """Return the factory of a configuration, whose encoder and memories compute on ``device``."""
         kind = load_plugin("memory", config.name)
-        settings = parse_settings(kind.settings_type, config.settings, f"memory {config.name!r}")
+        settings = make_settings("memory", config.name, config.settings)
         encoder = make_encoder(config.encoder, config.encoder_settings)
         if encoder.costly:
             key = json.dumps([config.encoder, dataclasses.asdict(encoder.settings), str(device)], default=str)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import Counter
 from collections.abc import Sequence
 
-from persist_cli.errors import PluginError
+from persist_cli.errors import PluginError, RecipeError
 from persist_cli.output.console import print_json, print_table, say
-from persist_cli.plugins import KINDS, Plugin, first_line, import_plugin, list_misplaced, list_plugins
+from persist_cli.plugins import KINDS, Plugin, first_line, import_plugin, list_misplaced, list_plugins, make_settings
 from persist_cli.recipe import make_recipe, read_recipe, recipe_names
 
 
@@ -49,6 +50,8 @@ def plugin_state(plugin: Plugin, claims: int) -> str:
         return f"name claimed by {claims} packages"
     try:
         loaded = import_plugin(plugin)
+        with contextlib.suppress(RecipeError):  # some must be given
+            make_settings(plugin.kind, plugin.name, {})
         missing = loaded.missing() if plugin.kind in ("simulator", "cost") else ""
     except PluginError as error:
         return error.cause

@@ -14,7 +14,7 @@ from persist_cli.api.stages import Stage
 from persist_cli.io.setting_docs import Setting, settings_of
 from persist_cli.io.settings import parse_settings
 from persist_cli.output.console import busy, print_json, say
-from persist_cli.plugins import load_plugin, network_type
+from persist_cli.plugins import load_plugin, make_settings, network_type
 from persist_cli.recipe import (
     ALONE,
     DATA_OF,
@@ -116,16 +116,16 @@ def _plugin_settings(recipe: Recipe) -> dict[str, list[Setting]]:
         return {"policy.settings": settings_of(network)}
     if recipe.scene is not None:
         model = load_plugin("scene model", recipe.scene.name).settings_type
-        parse_settings(model, recipe.scene.settings, f"scene model {recipe.scene.name!r}")
+        make_settings("scene model", recipe.scene.name, recipe.scene.settings)
         return {"scene.settings": settings_of(model)}
     config = recipe.backbone
     backbone = load_plugin("backbone", config.name)
-    parse_settings(backbone.settings_type, config.settings, f"backbone {config.name!r}")
+    make_settings("backbone", config.name, config.settings)
     settings = {"backbone.settings": settings_of(backbone.settings_type)}
     if recipe.memory is not None:
         memory, encoder = load_plugin("memory", recipe.memory.name), load_plugin("encoder", recipe.memory.encoder)
-        parse_settings(memory.settings_type, recipe.memory.settings, f"memory {recipe.memory.name!r}")
-        parse_settings(encoder.settings_type, recipe.memory.encoder_settings, f"encoder {recipe.memory.encoder!r}")
+        make_settings("memory", recipe.memory.name, recipe.memory.settings)
+        make_settings("encoder", recipe.memory.encoder, recipe.memory.encoder_settings)
         settings["memory.settings"] = settings_of(memory.settings_type)
         settings["memory.encoder_settings"] = settings_of(encoder.settings_type)
         settings["adapter"] = backbone.adapter_settings(recipe.adapter)
