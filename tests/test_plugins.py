@@ -148,7 +148,9 @@ def test_settings_that_nothing_can_keep_are_refused_before_any_work(persist, sit
 
 
 def test_settings_of_an_unknown_type_are_one_line_where_a_recipe_is_shown(persist, site, tmp_path):
-    install(site, "persist-mine", "persist.encoders", "mine = mine_ahead:Mine", SETTINGS.format(kind="'Later'", value=3))
+    install(
+        site, "persist-mine", "persist.encoders", "mine = mine_ahead:Mine", SETTINGS.format(kind="'Later'", value=3)
+    )
     (tmp_path / "a.yaml").write_text("extends: tiny-stage2-voxel\nmemory: {encoder: mine}\n")
     ended = persist("recipes", tmp_path / "a.yaml")
     assert (ended.code, len(ended.err.splitlines())) == (1, 1)

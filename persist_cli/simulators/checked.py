@@ -16,6 +16,7 @@ from persist_cli.data.storable import are_numbers, check_given_frame, check_info
 from persist_cli.plugins import check_simulator, faults_of, find_plugin, make_simulator
 
 STRAIGHT = 0.5  # cosine of the angle to ``ahead`` at least: an agent may slide along a wall
+MISPLACED = 0.1  # metres or radians at most: a scene's mesh may move the agent a little
 WALKED = 0.5  # of a step, from which on its direction is looked at
 
 
@@ -63,8 +64,16 @@ class CheckedSimulator(Simulator):
         self.is_free(((low[0] + high[0]) / 2, (low[1] + high[1]) / 2))
 
     def place(self, ground: tuple[float, float], heading: float) -> None:
-        """Put the agent there."""
+        """Put the agent there; it is broken where that puts it elsewhere."""
         self.given.place(ground, heading)
+        there, now = self.agent
+        off = math.hypot(there[0] - ground[0], there[1] - ground[1])
+        turned = abs(math.remainder(now - heading, math.tau))
+        if off > MISPLACED or turned > MISPLACED:
+            asked, found = (
+                f"({place[0]:.2f}, {place[1]:.2f}), {at:.2f}" for place, at in ((ground, heading), (there, now))
+            )
+            self._is_broken(f"place({asked}) put its agent at {found}")
 
     def observe(self) -> Frame:
         """What the agent's camera sees now."""

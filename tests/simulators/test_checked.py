@@ -181,6 +181,16 @@ def test_an_agent_that_goes_elsewhere_than_ahead_says_is_refused(collect) -> Non
         collect(replace(PLAN, scenes="0:6"), ahead=lambda own: (-own[0], own[1]))
 
 
+@pytest.mark.parametrize("agent", [((0.5, 0.0), 3.0), ((3.0, 1.0), 0.0)])
+def test_an_agent_that_is_put_elsewhere_is_refused(hall, monkeypatch: pytest.MonkeyPatch, agent: Any) -> None:
+    simulator = checked_simulator("hall", SIZE)
+    simulator.open_scene(0)
+    simulator.place((0.5, 0.0), 2 * math.tau)  # as heading 0
+    monkeypatch.setattr(Hall, "wrong", {"agent": agent})
+    with pytest.raises(PluginError, match=r"is broken: place\(\(0.50, 0.00\), 0.00\) put its agent at \("):
+        simulator.place((0.5, 0.0), 0.0)
+
+
 @pytest.mark.parametrize("things", [None, [(0.0, 0.0, 0.0)], [1.0]])
 def test_things_that_lie_nowhere_are_refused(collect, things: Any) -> None:
     with pytest.raises(PluginError, match=r"is broken: movable\(\) returned .*, not a sequence of ground positions"):
