@@ -200,7 +200,7 @@ def check_features(features: Any, encoder: str, channels: Any, frames: int) -> N
     if len(features) != frames or features.shape[3] != channels or not features[0].numel():
         wanted = f"{frames} frames of [rows, columns, {channels}]"
         raise _broken("encoder", encoder, f"encode gave {_kind(features)}, not {wanted}")
-    if features.is_meta or not is_finite(features):
+    if not is_finite(features):
         raise _broken("encoder", encoder, "encode gave features that are not finite")
 
 
