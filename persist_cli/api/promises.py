@@ -144,10 +144,10 @@ def check_points(points: Any, memory: str) -> None:
         points: what ``Memory.points`` returned.
         memory: the memory's name.
     """
-    parts = [getattr(points, part, None) for part in ("positions", "colors", "origins")]
+    parts: list[Any] = [getattr(points, part, None) for part in ("positions", "colors", "origins", "spread", "rise")]
     if any(part is None for part in parts):
         raise _broken("memory", memory, f"points gave {_kind(points)}, not MapPoints")
-    positions, colors, origins = parts
+    positions, colors, origins, spread, rise = parts
     if not (isinstance(positions, Tensor) and positions.is_floating_point() and positions.shape[1:] == (3,)):
         raise _broken("memory", memory, f"points gave positions as {_kind(positions)}, not float [point, 3]")
     if not _is_of(colors, torch.uint8, (len(positions), 3)):
@@ -156,9 +156,8 @@ def check_points(points: Any, memory: str) -> None:
         raise _broken("memory", memory, f"points gave origins as {_kind(origins)}, not uint8 [{len(positions)}]")
     if not is_finite(positions):
         raise _broken("memory", memory, "points gave positions that are not finite")
-    if len(positions) and int(points.origins.amax()) > max(CellOrigin):
+    if len(origins) and int(origins.amax()) > max(CellOrigin):
         raise _broken("memory", memory, f"points gave origins beyond {int(max(CellOrigin))}")
-    spread, rise = points.spread, points.rise
     if not (_is_length(spread) and math.isfinite(spread) and _is_length(rise)):
         raise _broken("memory", memory, f"points gave the spread {spread!r} and the rise {rise!r}, not metres")
 
@@ -170,7 +169,7 @@ def check_figures(figures: Any, memory: str) -> None:
         figures: what ``Memory.figures`` returned.
         memory: the memory's name.
     """
-    if not hasattr(figures, "cells") or not hasattr(figures, "imagined"):
+    if not all(hasattr(figures, part) for part in ("cells", "imagined", "bytes", "bounds")):
         raise _broken("memory", memory, f"figures gave {_kind(figures)}, not MemoryFigures")
     cells, imagined = figures.cells, figures.imagined
     if not all(isinstance(count, int) for count in (cells, imagined)) or not 0 <= imagined <= cells:
