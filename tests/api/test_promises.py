@@ -307,7 +307,7 @@ def test_a_cost_that_fits_no_body_is_named():
 
 
 class Careless(Memory):
-    """A memory that changes what it is given, by a method of a name."""
+    """A memory whose methods change what they are given."""
 
     def write(self, observations):
         observations.rgb[0].zero_()
