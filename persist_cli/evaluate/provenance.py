@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -40,15 +40,22 @@ def environment(processes: int) -> dict[str, Any]:
 
 
 def checkpoint_json(checkpoint: Checkpoint) -> dict[str, Any]:
-    """A checkpoint with the hashes of its base, recipes and adapters as JSON values."""
-    adapters = {name: file_sha256(folder / "adapter.safetensors") for name, folder in checkpoint.adapters.items()}
+    """A checkpoint with the hashes of its base, recipes, adapters and their settings as JSON values."""
+    adapters = {name: adapter_json(folder) for name, folder in checkpoint.adapters.items()}
     return {
         "name": checkpoint.name,
         "path": str(checkpoint.folder),
         "fingerprint": checkpoint.fingerprint,
         "recipe_sha256": recipe_sha256(checkpoint.folder),
-        "adapters": adapters,
+        "adapters": {name: hashes["weights"] for name, hashes in adapters.items()},
+        "adapter_settings": {name: hashes["settings"] for name, hashes in adapters.items()},
     }
+
+
+def adapter_json(folder: Path) -> dict[str, str]:
+    """The hashes of an adapter's weights and of its settings, among them the memory that it reads, as JSON values."""
+    weights, settings = file_sha256(folder / "adapter.safetensors"), files_sha256(folder, folder.glob("*.json"))
+    return {"weights": weights, "settings": settings}
 
 
 def scene_models(checkpoints: Sequence[Checkpoint], memories: Sequence[str]) -> list[dict[str, str]]:
@@ -103,11 +110,16 @@ def recipe_sha256(folder: Path) -> str | None:
     if (folder / lineage.RECIPE).is_file():
         return file_sha256(folder / lineage.RECIPE)
     home = folder / lineage.RECIPES
-    texts = {path.relative_to(home).as_posix(): path.read_bytes() for path in home.rglob("*.yaml")}
+    recipes = list(home.rglob("*.yaml"))
+    return files_sha256(home, recipes) if recipes else None
+
+
+def files_sha256(home: Path, paths: Iterable[Path]) -> str:
+    """SHA-256 over the names below ``home`` and the contents of some files."""
     digest = hashlib.sha256()
-    for name, text in sorted(texts.items()):
-        digest.update(name.encode() + b"\0" + hashlib.sha256(text).digest())
-    return digest.hexdigest() if texts else None
+    for name, path in sorted((path.relative_to(home).as_posix(), path) for path in paths):
+        digest.update(name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()
 
 
 def metric_json(metrics: Mapping[str, Metric]) -> dict[str, Any]:

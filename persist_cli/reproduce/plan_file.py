@@ -44,7 +44,7 @@ def base_json(base: str) -> dict[str, str]:
 def model_json(model: str) -> dict[str, Any]:
     """The place of a model with the hashes of its weights and adapters; ``CheckpointError`` when there is none."""
     hashes = checkpoint_json(find_checkpoint(Path(model)))
-    return {"path": model, "fingerprint": hashes["fingerprint"], "adapters": hashes["adapters"]}
+    return {"path": model} | {key: hashes[key] for key in ("fingerprint", "adapters", "adapter_settings")}
 
 
 def places(folders: Sequence[Path]) -> list[str]:

@@ -107,6 +107,17 @@ def test_the_hash_of_an_exports_recipes_depends_on_each_of_them(persist, stage1,
     assert checkpoint_json(find_checkpoint(tmp_path / "m"))["recipe_sha256"] != before
 
 
+def test_the_hash_of_an_adapters_settings_depends_on_its_memory(persist, stage1, voxel, tmp_path):
+    assert persist("export", stage1, voxel, "--out", tmp_path / "m").code == 0
+    before = checkpoint_json(find_checkpoint(tmp_path / "m"))
+    memory = without_sums(tmp_path / "m") / "adapters/voxel/memory.json"
+    values = json.loads(memory.read_text())
+    memory.write_text(json.dumps(values | {"settings": values["settings"] | {"cell": [0.5, 0.5, 0.5]}}))
+    after = checkpoint_json(find_checkpoint(tmp_path / "m"))
+    assert after["adapters"] == before["adapters"]
+    assert after["adapter_settings"] != before["adapter_settings"]
+
+
 def test_a_run_keeps_the_recipes_of_all_stages_before(persist, walks, codec, tmp_path):
     shutil.copytree(codec, tmp_path / "codec")
     for name, base in (("one", "codec"), ("two", "one")):

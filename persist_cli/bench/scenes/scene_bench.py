@@ -34,12 +34,11 @@ from persist_cli.bench.scenes.journal import SceneJournal
 from persist_cli.bench.scenes.training_houses import House, read_houses
 from persist_cli.bench.scenes.views import Region, View, near_camera, same_form, true_region
 from persist_cli.checkpoints.contamination import ALLOW, OTHER_DATA, ShownScene, known_names, refuse_training_scenes
-from persist_cli.checkpoints.lineage import MEMORY_FILE
 from persist_cli.checkpoints.scene_models import TrainedSceneModel, find_scene_model
 from persist_cli.data.reference import data_folder, parse_reference
 from persist_cli.data.store import Store, TrajectoryFile
 from persist_cli.errors import DataError, PersistError, hint
-from persist_cli.io.files import file_sha256
+from persist_cli.evaluate.provenance import adapter_json
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.memorize.memory_config import plugin_settings, scene_config
 from persist_cli.navigation.ground_mapper import body_of
@@ -330,13 +329,6 @@ def rendering_identity(plan: RenderingPlan) -> dict[str, Any]:
 
 
 def adapter_identities(plan: RenderingPlan) -> dict[str, dict[str, Any]]:
-    """Return for each adapter that draws frames the hashes of its weights and of what its memory is."""
+    """Return for each adapter that draws frames the hashes of its weights and settings."""
     folders = find_checkpoint(plan.checkpoint).adapters
-    return {
-        f"adapter {name}": {
-            "weights": file_sha256(folders[name] / "adapter.safetensors"),
-            "memory": file_sha256(folders[name] / MEMORY_FILE),
-        }
-        for name in plan.memories
-        if name in folders
-    }
+    return {f"adapter {name}": adapter_json(folders[name]) for name in plan.memories if name in folders}

@@ -254,6 +254,7 @@ class CheckpointRecord(ResultModel):
     recipe_sha256: str | None = None
     training_scenes: KnownScenes | None = None
     adapters: dict[str, str] = {}
+    adapter_settings: dict[str, str] = {}
     chosen_on: str | None = None
 
 
