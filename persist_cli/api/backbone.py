@@ -37,17 +37,22 @@ class Sampling:
         memory_guidance: weight of classifier-free guidance over memory, at least 0; 1 means none.
         context_noise: noise level that given frame and memory are declared to have, at least 0; each at most that of
             its training. Nothing is added.
+        autoguidance: weight of guidance away from the checkpoint's guide, a weaker version of the video model, at the
+            noisier half of the noise levels, at least 1; 1 means none (https://arxiv.org/abs/2406.02507).
     """
 
     steps: int = 50
     sampler: str = "ddim"
     memory_guidance: float = 1.0
     context_noise: float = 0.0
+    autoguidance: float = 1.0
 
     @property
     def words(self) -> str:
         """These settings in a few words, as in ``4 steps of unipc with guidance 1.5``."""
-        return f"{self.steps} step{'s' * (self.steps != 1)} of {self.sampler} with guidance {self.memory_guidance:g}"
+        words = f"{self.steps} step{'s' * (self.steps != 1)} of {self.sampler} with guidance {self.memory_guidance:g}"
+        noise = f" and context noise {self.context_noise:g}" * (self.context_noise > 0)
+        return words + noise + f" and autoguidance {self.autoguidance:g}" * (self.autoguidance != 1)
 
 
 class Backbone(nn.Module, ABC):
@@ -63,12 +68,14 @@ class Backbone(nn.Module, ABC):
     sharded_blocks: ClassVar[tuple[str, ...]] = ()  # class names of blocks that a sharded model gathers one by one
     never_sharded: ClassVar[tuple[str, ...]] = ()  # submodules that work outside of ``forward`` and are never sharded
     built_by: ClassVar[tuple[str, ...]] = ()  # settings that say how it is built, which a base has its own of
+    video_model: ClassVar[tuple[str, ...]] = ()  # files and folders of ``save_base`` that an export keeps of a guide
     name: str = ""  # set by the registry
 
     def __init__(self, settings: Any) -> None:
         super().__init__()
         self.settings = settings
         self.own_sampling: Sampling | None = None  # that its checkpoint asks for, ``None`` for that of all models
+        self.guide_folder: Path | None = None  # with the guide's ``video_model``, where its checkpoint has one
         self.on_denoised: Callable[[], None] | None = None  # called in `generate` after a denoising step, for progress
 
     @property
@@ -104,6 +111,13 @@ class Backbone(nn.Module, ABC):
             raise PersistError(f"guidance over memory of {sampling.memory_guidance}; it must be a number of at least 0")
         if not 0 <= sampling.context_noise < math.inf:
             raise PersistError(f"context noise of {sampling.context_noise}; it must be a number of at least 0")
+        if not 1 <= sampling.autoguidance < math.inf:
+            raise PersistError(f"autoguidance of {sampling.autoguidance}; it must be a number of at least 1, for none")
+        if sampling.autoguidance != 1 and self.guide_folder is None:
+            raise PersistError(
+                f"autoguidance of {sampling.autoguidance:g}: this checkpoint has no guide; persist export --guide "
+                "puts a weaker version of the model beside it"
+            )
 
     def check_clip_frames(self, frames: int) -> None:
         """Raise ``PersistError`` with one line when ``generate`` cannot make clips of so many frames.

@@ -33,12 +33,14 @@ STEP: Final = "step-"  # start of the names of the folders of a run's checkpoint
 PLAIN: Final = "stage1"  # name of the base without any adapter
 REFERENCE: Final = "reference"  # names the model that comes with the package
 STARTED_FROM: Final = "started_from"  # the key of a card for the base of a run that holds all weights itself
+GUIDE: Final = "guide"  # the folder of a weaker version of a checkpoint's video model, for autoguidance
 CODEC_ALONE: Final = "codec_alone"  # the key of a card for a codec that was exported without its video model
 SAMPLING_TYPES: Final = {  # a bool is no int here
     "steps": (int,),
     "sampler": (str,),
     "memory_guidance": (int, float),
     "context_noise": (int, float),
+    "autoguidance": (int, float),
 }
 SHOWN: Final = 12  # digits of a fingerprint in messages
 
@@ -349,11 +351,11 @@ def _sampling(value: Any, path: Path) -> Sampling:
     from persist_cli.api.backbone import Sampling
 
     valid = isinstance(value, dict) and all(type(item) in SAMPLING_TYPES.get(key, ()) for key, item in value.items())
-    numbers = [value.get(name, 1) for name in ("memory_guidance", "context_noise")] if valid else []
-    if not valid or value.get("steps", 1) < 1 or not all(0 <= number < float("inf") for number in numbers):
+    least = {"steps": 1, "memory_guidance": 0, "context_noise": 0, "autoguidance": 1}
+    if not valid or not all(low <= value.get(name, 1) < float("inf") for name, low in least.items()):
         raise CheckpointError(
             f"{path}: its sampling is {value}; it holds steps, at least 1, the name of a sampler, memory_guidance and "
-            "context_noise, at least 0"
+            "context_noise, at least 0, and autoguidance, at least 1"
         )
     return Sampling(**value)
 

@@ -93,12 +93,14 @@ class SamplingOverrides:
         sampler: name of one of the backbone's samplers.
         memory_guidance: weight of classifier-free guidance over memory, at least 0; 1 means none.
         context_noise: noise level that given frame and memory are declared to have, at least 0.
+        autoguidance: weight of guidance away from the checkpoint's guide, at least 1; 1 means none.
     """
 
     steps: int | None = None
     sampler: str | None = None
     memory_guidance: float | None = None
     context_noise: float | None = None
+    autoguidance: float | None = None
 
     def requested(self) -> dict[str, Any]:
         """Return the options that are not ``None`` by name."""
@@ -142,7 +144,7 @@ class SamplingOverrides:
         name, _, settings = text.partition(":")
         kinds: dict[str, tuple[str, Any]] = {
             "steps": ("steps", int), "sampler": ("sampler", str), "guidance": ("memory_guidance", float),
-            "context-noise": ("context_noise", float),
+            "context-noise": ("context_noise", float), "autoguidance": ("autoguidance", float),
         }  # fmt: skip
         values: dict[str, Any] = {}
         for setting in settings.split(","):

@@ -13,7 +13,8 @@ from typing import Any, Final
 import torch
 
 from persist_cli import __version__
-from persist_cli.api.checkpoint import CODEC_ALONE, PLAIN, Checkpoint, find_checkpoint, lora_base
+from persist_cli.api.backbone import Sampling
+from persist_cli.api.checkpoint import CODEC_ALONE, GUIDE, PLAIN, Checkpoint, find_checkpoint, lora_base
 from persist_cli.api.inference import SamplingOverrides
 from persist_cli.api.scene import Scene
 from persist_cli.api.training_scenes import TrainingScenes
@@ -26,6 +27,7 @@ from persist_cli.checkpoints.exported_files import (
     summed_files,
     without_absolute_paths,
 )
+from persist_cli.checkpoints.guides import find_guide
 from persist_cli.checkpoints.lineage import (
     ADAPTERS,
     MEMORY_FILE,
@@ -73,10 +75,11 @@ class ExportPlan:
     sampling: SamplingOverrides
     protocol_sampling: Mapping[str, SamplingOverrides] = field(default_factory=dict)
     codec: bool = False
+    guide: Path | None = None
 
     def check_options(self, network: str) -> None:
-        """Raise ``PersistError`` when adapters or a sampling are named for a network that has none."""
-        if self.runs or self.default or self.sampling.requested() or self.protocol_sampling:
+        """Raise ``PersistError`` when adapters, a sampling or a guide are named for a network that has none."""
+        if self.runs or self.default or self.sampling.requested() or self.protocol_sampling or self.guide:
             raise PersistError(
                 f"{self.checkpoint}: {network} has no adapters and no sampling; give --dtype and --out alone"
             )
@@ -123,19 +126,20 @@ def run_export(plan: ExportPlan, out: Path, json: bool) -> None:
         return
     adapters = _find_adapters(base, plan.runs)
     base = _sampled_as(adapters, base, plan.sampling)
+    guide = find_guide(plan.guide, base) if plan.guide else {}
     defaults = {
         "dtype": plan.dtype,
         "default_adapter": _default_adapter(base, adapters, plan.default),
-        "sampling": _default_sampling(base, plan.sampling),
+        "sampling": _default_sampling(base, plan),
     }
     protocols = _protocol_sampling(base, plan)
     defaults |= {"protocol_sampling": protocols} if protocols else {}
-    scenes = training_scenes(base)
+    scenes = training_scenes(base) | (training_scenes(find_checkpoint(plan.guide)) if plan.guide else TrainingScenes())
     for adapter in adapters.values():
         scenes |= training_scenes(adapter.checkpoint)
     with folder_aside(out) as folder:
         with _merged_base(base, folder) as home:
-            _write_checkpoint(folder, home, adapters, PRECISIONS[plan.dtype])
+            _write_checkpoint(folder, home, adapters, guide, PRECISIONS[plan.dtype])
         save_stage_recipes(folder, _recipes(base, adapters))
         written = _write_card(folder, base, defaults, scenes)
     print_files(out, {"fingerprint": written} | defaults, summed_files(out), json)
@@ -161,7 +165,7 @@ def export_codec(plan: ExportPlan, base: Checkpoint, out: Path, json: bool) -> N
             with busy("loading the codec"), torch.random.fork_rng(devices=[]):
                 torch.manual_seed(0)
                 fresh_on_codec(base, {}).save_base(home)
-            _write_checkpoint(folder, home, {}, PRECISIONS[plan.dtype])
+            _write_checkpoint(folder, home, {}, {}, PRECISIONS[plan.dtype])
         save_stage_recipes(
             folder, {name: text for name, text in _recipes(base, {}).items() if name.startswith("codec")}
         )
@@ -281,17 +285,24 @@ def _sampled_as(adapters: Mapping[str, AdapterSource], base: Checkpoint, request
     return dataclasses.replace(base, sampling=asked.sampling, protocol_sampling=asked.protocol_sampling)
 
 
-def _default_sampling(base: Checkpoint, requested: SamplingOverrides) -> dict[str, Any] | None:
+def _default_sampling(base: Checkpoint, plan: ExportPlan) -> dict[str, Any] | None:
     """The default sampling of the export, ``None`` when neither the options nor the checkpoint have one.
 
     Raises:
         PersistError: when the backbone cannot sample so.
     """
-    if base.sampling is None and not requested.requested():
+    if base.sampling is None and not plan.sampling.requested():
         return None
-    sampling = base.sampling_with(requested)
-    empty_backbone(base).check_sampling(sampling)
+    sampling = base.sampling_with(plan.sampling)
+    _check_sampling(base, plan, sampling)
     return asdict(sampling)
+
+
+def _check_sampling(base: Checkpoint, plan: ExportPlan, sampling: Sampling) -> None:
+    """Raise ``PersistError`` when the backbone, with the guide that it gets, cannot sample so."""
+    backbone = empty_backbone(base)
+    backbone.guide_folder = plan.guide or backbone.guide_folder
+    backbone.check_sampling(sampling)
 
 
 def _protocol_sampling(base: Checkpoint, plan: ExportPlan) -> dict[str, dict[str, Any]]:
@@ -306,21 +317,26 @@ def _protocol_sampling(base: Checkpoint, plan: ExportPlan) -> dict[str, dict[str
         for protocol in (*base.protocol_sampling, *plan.protocol_sampling)
     }
     for sampling in samplings.values():
-        empty_backbone(base).check_sampling(sampling)
+        _check_sampling(base, plan, sampling)
     return {protocol: asdict(sampling) for protocol, sampling in samplings.items()}
 
 
-def _write_checkpoint(folder: Path, home: Path, adapters: dict[str, AdapterSource], dtype: torch.dtype) -> None:
-    """Write a base's own files and adapters into the folder.
+def _write_checkpoint(
+    folder: Path, home: Path, adapters: dict[str, AdapterSource], guide: dict[str, Path], dtype: torch.dtype
+) -> None:
+    """Write a base's own files, its guide and adapters into the folder.
 
     Args:
         folder: the folder.
         home: where the base's own files are.
         adapters: by the names that they get.
+        guide: files of its guide by name; without any that of the base is copied, where it has one.
         dtype: precision of the weights.
     """
     paths = [path.relative_to(home) for path in base_files(home, "*")]
+    paths = [path for path in paths if not (guide and path.parts[0] == GUIDE)]
     jobs = [(home / path, folder / path) for path in paths if is_copied(path)]
+    jobs += [(path, folder / GUIDE / name) for name, path in guide.items()]
     for name, adapter in adapters.items():
         files = sorted(path for path in adapter.folder.glob("[!.]*") if path.is_file())
         jobs += [(path, folder / ADAPTERS / name / path.name) for path in files]

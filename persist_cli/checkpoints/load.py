@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from persist_cli.api.checkpoint import CODEC_ALONE, PLAIN, Checkpoint, find_checkpoint, read_card
+from persist_cli.api.checkpoint import CODEC_ALONE, GUIDE, PLAIN, Checkpoint, find_checkpoint, read_card
 from persist_cli.api.inference import CONSISTENCY
 from persist_cli.api.scene import Scene
 from persist_cli.checkpoints.lineage import MEMORY_FILE, RECIPE
@@ -42,12 +42,15 @@ def load_backbone(
 
 
 def empty_backbone(checkpoint: Checkpoint, settings: dict[str, Any] | None = None) -> Backbone:
-    """The backbone of the checkpoint's base on the meta device, without weights."""
+    """The backbone of the checkpoint's base on the meta device, without weights; it knows where its guide is."""
     from persist_cli.api.meta_device import without_weights
     from persist_cli.plugins import make_backbone
 
     with without_weights():
-        return make_backbone(checkpoint.backbone, merge_settings(checkpoint.settings, settings or {}))
+        backbone = make_backbone(checkpoint.backbone, merge_settings(checkpoint.settings, settings or {}))
+    guide = checkpoint.base_folder / GUIDE
+    backbone.guide_folder = guide if guide.is_dir() else None
+    return backbone
 
 
 def load_adapter(backbone: Backbone, checkpoint: Checkpoint, adapter: str | None) -> None:

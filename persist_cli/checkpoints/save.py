@@ -109,13 +109,15 @@ def own_sampling(backbone: Backbone) -> dict[str, Any]:
 def asked_sampling(backbone: Backbone, base: Checkpoint | None) -> dict[str, Any]:
     """The sampling that the card of a video model asks for: its own, else that of the base that it was trained on.
 
-    That of a distilled base is not kept, for the training undoes it.
+    That of a distilled base is not kept, for the training undoes it, and no autoguidance, for the guide is not written.
     """
     own = own_sampling(backbone)
     if own or base is None or base.sampling is None or base.sampling.sampler == CONSISTENCY:
         return own
-    protocols = {name: dataclasses.asdict(sampling) for name, sampling in base.protocol_sampling.items()}
-    return {"sampling": dataclasses.asdict(base.sampling)} | ({"protocol_sampling": protocols} if protocols else {})
+    alone = {"autoguidance": 1.0}
+    protocols = {name: dataclasses.asdict(sampling) | alone for name, sampling in base.protocol_sampling.items()}
+    kept = {"sampling": dataclasses.asdict(base.sampling) | alone}
+    return kept | ({"protocol_sampling": protocols} if protocols else {})
 
 
 def base_files(folder: Path, pattern: str) -> list[Path]:

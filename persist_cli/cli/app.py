@@ -17,6 +17,7 @@ from persist_cli.cli.catalog import catalog_app
 from persist_cli.cli.measuring import measuring_app
 from persist_cli.cli.options import (
     ActionsOption,
+    AutoguidanceOption,
     BodyOption,
     Commands,
     ContextNoiseOption,
@@ -242,6 +243,8 @@ def export(
     sampler: Annotated[str | None, typer.Option(help="Sampler when none is named.")] = None,
     guidance: Annotated[float | None, typer.Option(min=0, help="Guidance over memory when none is named.")] = None,
     context_noise: Annotated[float | None, typer.Option(min=0, help="Declared noise when none is named.")] = None,
+    autoguidance: Annotated[float | None, typer.Option(min=1, help="Away from the guide when none is named.")] = None,
+    guide: Annotated[Path | None, typer.Option(help="A weaker version of the model, as one trained less.")] = None,
     sampling_for: Annotated[
         list[str] | None, typer.Option(help="Of a protocol of eval, as in return:steps=20,sampler=ddim,guidance=1.")
     ] = None,
@@ -255,11 +258,11 @@ def export(
     """
     from persist_cli.checkpoints.export import ExportPlan, run_export
 
-    sampling = SamplingOverrides(steps, sampler, guidance, context_noise)
+    sampling = SamplingOverrides(steps, sampler, guidance, context_noise, autoguidance)
     protocols = SamplingOverrides.by_protocol(sampling_for or [])
     plan = ExportPlan(
         checkpoint=checkpoint, runs=runs or [], dtype=dtype, default=default, sampling=sampling,
-        protocol_sampling=protocols, codec=codec,
+        protocol_sampling=protocols, codec=codec, guide=guide,
     )  # fmt: skip
     run_export(plan, out, json)
 
@@ -349,6 +352,7 @@ def rollout(
     sampler: SamplerOption = None,
     guidance: GuidanceOption = None,
     context_noise: ContextNoiseOption = None,
+    autoguidance: AutoguidanceOption = None,
     dtype: DtypeOption = None,
     save_memory: SaveMemoryOption = None,
     verify: VerifyOption = False,
@@ -367,7 +371,7 @@ def rollout(
 
     world = WorldOptions(
         start=start, memory=memory, adapter=adapter, write=write, seed=seed, body=body,
-        sampling=SamplingOverrides(steps, sampler, guidance, context_noise),
+        sampling=SamplingOverrides(steps, sampler, guidance, context_noise, autoguidance),
         placement=InferenceOptions.of(dtype, save_memory),
     )  # fmt: skip
     plan = RolloutPlan(

@@ -10,6 +10,7 @@ import typer
 
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.cli.options import (
+    AutoguidanceOption,
     CemSettingsOption,
     ContextNoiseOption,
     DtypeOption,
@@ -125,6 +126,7 @@ def bench_collisions(
     sampler: SamplerOption = None,
     guidance: GuidanceOption = None,
     context_noise: ContextNoiseOption = None,
+    autoguidance: AutoguidanceOption = None,
     dtype: DtypeOption = None,
     save_memory: SaveMemoryOption = None,
     verify: VerifyOption = False,
@@ -143,7 +145,7 @@ def bench_collisions(
             simulator=simulator, scenes=scenes, split=split, seed=seed, settings=apply_overrides({}, settings or ())
         ), walks=walks, actions=actions,
         memories=None if memories is None else split_names(memories),
-        sampling=SamplingOverrides(steps, sampler, guidance, context_noise),
+        sampling=SamplingOverrides(steps, sampler, guidance, context_noise, autoguidance),
         placement=InferenceOptions.of(dtype, save_memory),
     )  # fmt: skip
     run_collisions(checkpoint, plan, out, json)

@@ -10,6 +10,7 @@ import typer
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.cli.options import (
     DEFAULT_CONTROLS,
+    AutoguidanceOption,
     CheckpointsArgument,
     CompareOption,
     ContextNoiseOption,
@@ -50,6 +51,7 @@ def evaluate(
     sampler: SamplerOption = None,
     guidance: GuidanceOption = None,
     context_noise: ContextNoiseOption = None,
+    autoguidance: AutoguidanceOption = None,
     sampling_of: SamplingOfOption = None,
     dtype: DtypeOption = None,
     save_memory: SaveMemoryOption = None,
@@ -76,12 +78,12 @@ def evaluate(
     from persist_cli.evaluate.plan import EvalPlan
 
     plan = EvalPlan(
-        data=tuple(data or []), metrics=split_names(metrics), frames=frames, clips=clips, seeds=seeds,
-        memories=None if memories is None else split_names(memories), controls_named=controls is not None, batch=batch,
-        controls=split_names(DEFAULT_CONTROLS if controls is None else controls), noise=pose_noise, resample=resample,
-        sampling=SamplingOverrides(steps, sampler, guidance, context_noise), training_seeds=training_seeds,
+        protocol=protocol, noise=pose_noise, frames=frames, clips=clips, batch=batch, training_seeds=training_seeds,
+        data=tuple(data or []), metrics=split_names(metrics), placement=InferenceOptions.of(dtype, save_memory),
+        memories=None if memories is None else split_names(memories), new_poses=NewPoses(*new_poses), seeds=seeds,
+        controls=split_names(DEFAULT_CONTROLS if controls is None else controls), controls_named=controls is not None,
+        sampling=SamplingOverrides(steps, sampler, guidance, context_noise, autoguidance), resample=resample,
         sampling_of=SamplingOverrides.by_memory(sampling_of or ()), allow_training_scenes=allow_training_scenes,
-        placement=InferenceOptions.of(dtype, save_memory), new_poses=NewPoses(*new_poses), protocol=protocol,
     )  # fmt: skip
     run_eval(checkpoints or [], plan, out, report, json)
 

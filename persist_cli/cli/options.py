@@ -93,6 +93,13 @@ ContextNoiseOption = Annotated[
     ),
 ]
 
+AutoguidanceOption = Annotated[
+    float | None,
+    typer.Option(
+        "--autoguidance", min=1, help="Away from the checkpoint's guide, if it has one; the checkpoint's, else 1: none."
+    ),
+]
+
 StoredTurnOption = Annotated[
     float | None,
     typer.Option("--turn", min=0.001, max=180.0, help="Store walking actions: degrees of a turn."),

@@ -91,11 +91,7 @@ def common_sampling(checkpoints: Sequence[Checkpoint], overrides: SamplingOverri
     checkpoints_by_sampling = {checkpoint.sampling_with(overrides, protocol): checkpoint for checkpoint in checkpoints}
     if len(checkpoints_by_sampling) > 1:
         samplings = " and ".join(
-            f"{checkpoint.folder} means {sampling.steps} steps of {sampling.sampler} with guidance "
-            f"{sampling.memory_guidance:g}"
-            + f" and context noise {sampling.context_noise:g}"
-            * (sampling.context_noise > 0)
-            for sampling, checkpoint in checkpoints_by_sampling.items()
+            f"{checkpoint.folder} means {sampling.words}" for sampling, checkpoint in checkpoints_by_sampling.items()
         )
-        raise CheckpointError(f"{samplings}; name --steps, --sampler, --guidance and --context-noise")
+        raise CheckpointError(f"{samplings}; name --steps, --sampler, --guidance, --context-noise and --autoguidance")
     return next(iter(checkpoints_by_sampling))

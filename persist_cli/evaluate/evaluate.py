@@ -109,6 +109,7 @@ def results_json(run: Evaluation, processes: int) -> dict[str, Any]:
             "sampler": run.sampling.sampler,
             "memory_guidance": run.sampling.memory_guidance,
             "context_noise": run.sampling.context_noise,
+            "autoguidance": run.sampling.autoguidance,
             "sampling_of": own_samplings(run),
             "seeds": list(range(run.plan.seeds)),
             "batch": run.plan.batch,

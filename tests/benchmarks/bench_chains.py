@@ -1,8 +1,9 @@
 """What a video model invents by itself: chains of clips without memory, each from the last frame of the one before.
 
     persist collect miniworld --out runs/validation --scenes 0:8 --frames 129 --split validation --policy path
-    python tests/benchmarks/bench_chains.py runs/stage1 runs/other --data runs/validation --samplings 20:ddim 8:ddim
+    python tests/benchmarks/bench_chains.py runs/stage1 runs/other --data runs/validation --samplings 8:ddim 8:ddim:3
 
+A third part of a sampling is the weight of autoguidance, for checkpoints with a guide.
 The first trajectories of each data set are walked from their frame ``--start`` on, by a model without memory. Prints
 likeness to the truth, sharpness and grain for each clip of the chain, over all walks, and FVD of all pieces of 16
 frames, which few walks bias upwards: compare rows of one run. Asserts nothing. ``--sheets`` draws frames of each walk
@@ -47,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--each", type=int, default=8, help="trajectories of each data set")
     parser.add_argument("--start", type=int, default=20, help="number of the given frame")
     parser.add_argument("--clips", type=int, default=4, help="clips of a chain")
-    parser.add_argument("--samplings", nargs="+", default=["8:ddim"], metavar="STEPS:SAMPLER")
+    parser.add_argument("--samplings", nargs="+", default=["8:ddim"], metavar="STEPS:SAMPLER[:WEIGHT]")
     parser.add_argument("--sheets", type=Path, help="folder for pictures")
     parser.add_argument("--out", type=Path, help="JSON file to write")
     options = parser.parse_args(arguments)
@@ -58,15 +59,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
         walks = read_walks(options.data, options.each, options.start, options.clips * frames + 1)
         videos: dict[str, list[Tensor]] = {}
         for text in options.samplings:
-            steps, sampler = text.split(":")
-            predicted = chain(backbone, walks, Sampling(int(steps), sampler), options.clips)
+            steps, sampler, *weight = text.split(":")
+            sampling = Sampling(int(steps), sampler, autoguidance=float(weight[0]) if weight else 1.0)
+            predicted = chain(backbone, walks, sampling, options.clips)
             rows.append({"model": path.name, "sampling": text} | figures(walks, predicted, frames))
             pairs = zip(walks, predicted, strict=True)
             videos[text] = [part for walk, made in pairs for part in pieces(torch.cat([walk.rgb[:1], made.rgb]))]
             if options.sheets:
                 pairs = zip(walks, predicted, strict=True)
                 shown = [row for walk, made in pairs for row in (("truth", walk.rgb[1:]), (path.name, made.rgb))]
-                write_sheet(options.sheets / f"{path.name}-{steps}-{sampler}.png", shown, most=FRAMES)
+                write_sheet(options.sheets / f"{path.name}-{text.replace(':', '-')}.png", shown, most=FRAMES)
         distances = fvd_of_rows(videos, [part for walk in walks for part in pieces(walk.rgb)])
         for row in rows[-len(videos) :]:
             row["fvd"] = [distances[row["sampling"]]]

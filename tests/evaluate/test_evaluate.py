@@ -73,7 +73,7 @@ def test_the_results_hold_all_that_is_needed_to_measure_again(uninterrupted, vox
     assert values["command"][-2:] == ["--report", str(uninterrupted / "report")]
     assert values["sampling"] == {
         "chosen": "named on the command line", "steps": 2, "sampler": "ddim", "memory_guidance": 1.0,
-        "context_noise": 0.0, "sampling_of": {}, "seeds": [0, 1], "batch": 1,
+        "context_noise": 0.0, "autoguidance": 1.0, "sampling_of": {}, "seeds": [0, 1], "batch": 1,
     }  # fmt: skip
     assert len(values["measured"]["data"][0]["trajectories"]["loop-0"]) == 64
     assert values["measured"]["metrics"]["psnr"]["definition"].startswith("dB")

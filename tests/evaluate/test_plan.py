@@ -43,9 +43,9 @@ def test_checkpoints_whose_cards_give_different_samplings_need_options_that_name
     b = write_model(tmp_path / "b", 0.2, {"steps": 2, "sampler": "unipc", "memory_guidance": 1.5})
     for pair in ((a, b), (b, a)):
         error = refused(persist, "eval", *pair, "--data", held_out, *ONE, "--out", tmp_path / "o")
-        assert "a/voxel means 1 steps of ddim with guidance 1" in error
+        assert "a/voxel means 1 step of ddim with guidance 1" in error
         assert "b/voxel means 2 steps of unipc with guidance 1.5" in error
-        assert error.endswith("; name --steps, --sampler, --guidance and --context-noise")
+        assert error.endswith("; name --steps, --sampler, --guidance, --context-noise and --autoguidance")
     assert not (tmp_path / "o").exists()
     named = ["--steps", 1, "--sampler", "unipc", "--guidance", 1]
     assert persist("eval", a, b, "--data", held_out, *ONE, *named, "--out", tmp_path / "o").code == 0

@@ -40,13 +40,11 @@ from persist_backbones.cogvideox.given_view import views_of_given
 from persist_backbones.cogvideox.inputs import (
     ClipShape,
     camera_latents,
-    camera_tokens,
     check_clip_frames,
     check_fit,
     clip_shape,
     fit_positions,
     interaction_rows,
-    model_input,
     rotary_grid,
     rotary_positions,
 )
@@ -84,6 +82,7 @@ class CogVideoX(AdaptedBackbone):
     sharded_blocks = ("CogVideoXBlock", "MemoryBlock", "CanvasBlock")
     never_sharded = ("codec",)
     built_by = ("transformer", "prediction", "vae")
+    video_model = ("transformer", "world.safetensors")
     settings: CogVideoXSettings
     prompt: Tensor
 
@@ -230,10 +229,7 @@ class CogVideoX(AdaptedBackbone):
             conditions: all other inputs of the transformer.
             branch: name of this prediction among those of a step, for caches from step to step.
         """
-        latents = model_input(noisy, image, conditions.camera, self.settings.depth)
-        camera = camera_tokens(conditions.camera, self.shape.patch, self.shape.token_frames)
-        predicted: Tensor = self.transformer(latents, dataclasses.replace(conditions, camera=camera))
-        return predicted
+        return self.transformer.predict(noisy, image, conditions, self.shape, self.settings.depth)
 
     def generate(self, first: Clips, sampling: Sampling) -> tuple[Tensor, Tensor]:
         """Generate clips from each sample's own noise; the first frame is that of ``first``."""

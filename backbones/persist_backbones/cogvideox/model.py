@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from persist_backbones.adapters.base import MemoryCondition, NoiseLevel, VideoShape
 from persist_backbones.cogvideox.config import CogVideoXSettings
-from persist_backbones.cogvideox.inputs import RAY_CHANNELS, ClipShape
+from persist_backbones.cogvideox.inputs import RAY_CHANNELS, ClipShape, camera_tokens, model_input
 from persist_backbones.diffusers_models import AutoencoderKLCogVideoX, CogVideoXTransformer3DModel
 from persist_backbones.noise_levels import LevelEmbedding
 from persist_backbones.tensors import fold_patches, frames_per_token, tokens_of, unfold_patches, zero_init
@@ -107,6 +107,15 @@ class WorldTransformer(nn.Module):
             outputs=self.out_channels,
             token_frames=frames_per_token(config),
         )
+
+    def predict(
+        self, noisy: Tensor, image: Tensor, conditions: Conditions, shape: ClipShape, depth: bool
+    ) -> Float[Tensor, "batch frame out height width"]:
+        """Predict from noisy latents and those of the image condition; the conditions' cameras are latents, too."""
+        latents = model_input(noisy, image, conditions.camera, depth)
+        camera = camera_tokens(conditions.camera, shape.patch, shape.token_frames)
+        predicted: Tensor = self(latents, replace(conditions, camera=camera))
+        return predicted
 
     def forward(
         self, latents: Float[Tensor, "batch frame channel height width"], conditions: Conditions

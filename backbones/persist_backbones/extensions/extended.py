@@ -16,6 +16,7 @@ from persist_backbones.cogvideox.model import Conditions, WorldTransformer
 from persist_backbones.cogvideox.parameter_groups import DISCRIMINATOR
 from persist_backbones.cogvideox.parts import DiffusersParts, save_world
 from persist_backbones.extensions.adversarial import Discriminator, adversarial_loss, make_discriminator
+from persist_backbones.extensions.autoguidance import Autoguidance, load_guide
 from persist_backbones.extensions.distillation import (
     Distillation,
     check_levels,
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
 
 
 class ExtendedCogVideoX(CogVideoX):
-    """CogVideoX with LoRA, memory savings in training, and CPU offload and caches in sampling.
+    """CogVideoX with LoRA, memory savings in training, and CPU offload, caches and autoguidance in sampling.
 
     Args:
         settings: the preset or pretrained directory, and sizes.
@@ -47,6 +48,8 @@ class ExtendedCogVideoX(CogVideoX):
         self.frozen = FrozenWeights(self, None)
         self.offloaded: OffloadedParts | None = None
         self.caches: ClipCaches | None = None  # while a clip is sampled
+        self.guides: list[WorldTransformer] = []  # one at most, once loaded; in a list it is no part of the model
+        self.autoguidance: Autoguidance | None = None  # while a clip is sampled
         self.distillation: Distillation | None = None
         self.adversarial: Adversarial | None = None
         self.discriminator: Discriminator | None = None
@@ -88,17 +91,33 @@ class ExtendedCogVideoX(CogVideoX):
         generators: list[torch.Generator] | None = None,
         noise: Tensor | None = None,
     ) -> Tensor:
-        """Denoise latents of clips from noise, with the caches that are enabled; see ``CogVideoX.sample``."""
-        if not has_cache(self.transformer):
-            return super().sample(first, sampling, on_step, generators, noise)
-        from persist_backbones.extensions.caches import ClipCaches  # diffusers' hooks take a second to import
+        """Denoise latents of clips from noise, with enabled caches and autoguidance; see ``CogVideoX.sample``."""
+        if has_cache(self.transformer):
+            from persist_backbones.extensions.caches import ClipCaches  # diffusers' hooks take a second to import
 
-        self.caches = ClipCaches(self.transformer)
+            self.caches = ClipCaches(self.transformer)
         try:
+            self.autoguidance = self.guidance_of(sampling)
             return super().sample(first, sampling, on_step, generators, noise)
         finally:
-            self.caches.forget()
-            self.caches = None
+            self.autoguidance = None
+            if self.caches is not None:
+                self.caches.forget()
+                self.caches = None
+
+    def guidance_of(self, sampling: Sampling) -> Autoguidance | None:
+        """Return the guidance away from the guide that a sampling asks for; the guide is loaded the first time."""
+        if sampling.autoguidance == 1:
+            return None
+        self.check_sampling(sampling)
+        if not self.guides and self.guide_folder is not None:
+            self.guides.append(load_guide(self, self.guide_folder))
+        return Autoguidance(self, self.guides[0], sampling.autoguidance)
+
+    def predict_guided(self, noisy: Tensor, image: Tensor, conditions: Conditions, guidance: float) -> Tensor:
+        """Predict with guidance over memory, and away from the guide."""
+        predicted = super().predict_guided(noisy, image, conditions, guidance)
+        return predicted if self.autoguidance is None else self.autoguidance.lead(predicted, noisy, image, conditions)
 
     def predict(self, noisy: Tensor, image: Tensor, conditions: Conditions, branch: str = "cond") -> Tensor:
         """Predict from noisy latents; a cache may replace some blocks of the transformer."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from persist_cli.api.checkpoint import CARD, POLICY_CARD, SCENE_CARD, STEP, checkpoint_folder, find_checkpoint
+from persist_cli.api.checkpoint import CARD, GUIDE, POLICY_CARD, SCENE_CARD, STEP, checkpoint_folder, find_checkpoint
 from persist_cli.api.memory_file import is_memory_file, read_header
 from persist_cli.io.command_line import quoted
 from persist_cli.io.files import read_json
@@ -65,7 +65,9 @@ def _describe_checkpoint(path: Path) -> str:
     is_run = any(path.glob(f"{STEP}*/model"))
     kind = f"a finetune run, its newest checkpoint {checkpoint.folder.parent.name}" if is_run else "a checkpoint folder"
     adapters, word = ", ".join(checkpoint.adapters), quoted(path)
+    parts = f"adapters {adapters}" if adapters else "no memory adapter"
+    guide = ", a guide" * (checkpoint.base_folder / GUIDE).is_dir()
     return (
-        f"{kind}: backbone {checkpoint.backbone}, {f'adapters {adapters}' if adapters else 'no memory adapter'}; "
+        f"{kind}: backbone {checkpoint.backbone}, {parts}{guide}; "
         f"`persist rollout {word} --start DATA#0:0` rolls it out, `persist eval {word} --data DATA` measures it"
     )

@@ -61,7 +61,8 @@ def _sampled(sampling: SamplingSettings) -> str:
         return "unknown steps"
     guidance = "" if sampling.memory_guidance in (None, 1.0) else f", guidance over memory {sampling.memory_guidance:g}"
     noise = f", declared context noise {sampling.context_noise:g}" if sampling.context_noise else ""
-    return f"{counted(sampling.steps, 'steps')} of {sampling.sampler}{guidance}{noise}"
+    away = f", autoguidance {sampling.autoguidance:g}" if sampling.autoguidance != 1 else ""
+    return f"{counted(sampling.steps, 'steps')} of {sampling.sampler}{guidance}{noise}{away}"
 
 
 def training_seed_line(results: EvalResults) -> str:

@@ -265,6 +265,7 @@ class SamplingSettings(ResultModel):
     sampler: str | None = None
     memory_guidance: float | None = None
     context_noise: float = 0.0
+    autoguidance: float = 1.0
 
 
 class SamplingRecord(SamplingSettings):

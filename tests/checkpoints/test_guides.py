@@ -1,0 +1,115 @@
+"""Guides in exports: what is written, who keeps them, and which weaker versions cannot guide."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+
+from persist_cli.api.backbone import Sampling
+from persist_cli.api.checkpoint import find_checkpoint
+from persist_cli.checkpoints.load import load_backbone
+from persist_cli.checkpoints.save import save_base
+from persist_cli.errors import CheckpointError
+from tests.support.damage import without_sums
+from tests.support.export_runs import write_base, write_runs
+from tests.support.guided import write_weaker
+from tests.support.micro_model import random_clips
+from tests.support.micro_runs import MICRO, run_persist
+
+GUIDED = ("--steps", 4, "--sampler", "ddim", "--autoguidance", 3)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    folder = write_runs(tmp_path_factory.mktemp("guiding"))
+    write_weaker(folder / "stage1", folder / "weaker")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def model(runs):
+    """An export with a guide."""
+    sources = (runs / "stage1", runs / "voxel", "--guide", runs / "weaker")
+    run_persist(*map(str, ("export", *sources, *GUIDED, "--dtype", "float32", "--out", runs / "model")))
+    return runs / "model"
+
+
+def clip(path, autoguidance):
+    return load_backbone(find_checkpoint(path)).generate(random_clips(1), Sampling(4, autoguidance=autoguidance))[0]
+
+
+def test_an_export_has_the_weaker_video_model_beside_its_own(model, runs):
+    guide = sorted(path.relative_to(model / "guide").as_posix() for path in (model / "guide").rglob("*.*"))
+    assert guide == ["transformer/config.json", "transformer/diffusion_pytorch_model.safetensors", "world.safetensors"]
+    assert find_checkpoint(model).sampling == Sampling(4, autoguidance=3.0)
+    assert "guide/world.safetensors" in (model / "SHA256SUMS").read_text()
+    assert torch.equal(clip(model, 1.0), clip(runs / "stage1", 1.0))
+    assert not torch.equal(clip(model, 3.0), clip(model, 1.0))
+
+
+def test_an_export_of_an_export_keeps_its_guide_and_another_one_takes_its_place(persist, model, runs, tmp_path):
+    assert persist("export", model, "--dtype", "float32", "--out", tmp_path / "again").code == 0
+    assert torch.equal(clip(tmp_path / "again", 3.0), clip(model, 3.0))
+    assert find_checkpoint(tmp_path / "again").fingerprint == find_checkpoint(model).fingerprint
+    assert persist("export", model, "--guide", runs / "stage1", "--dtype", "float32", "--out", tmp_path / "m").code == 0
+    torch.testing.assert_close(clip(tmp_path / "m", 3.0), clip(model, 1.0), atol=1, rtol=0)  # guided by itself
+    assert find_checkpoint(tmp_path / "m").fingerprint != find_checkpoint(model).fingerprint
+
+
+def test_a_stage_1_that_is_trained_on_has_neither_guide_nor_autoguidance(model, tmp_path):
+    (tmp_path / "on").mkdir()
+    base = find_checkpoint(model)
+    save_base(load_backbone(base), tmp_path / "on", base=base)
+    assert find_checkpoint(tmp_path / "on").sampling == Sampling(4)
+    assert not (tmp_path / "on" / "guide").exists()
+
+
+def test_a_damaged_guide_is_told_when_the_model_is_loaded(persist, model, tmp_path):
+    assert persist("export", model, "--out", tmp_path / "m").code == 0
+    weights = tmp_path / "m/guide/world.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-1])
+    with pytest.raises(CheckpointError, match="guide/world\\.safetensors"):
+        load_backbone(find_checkpoint(tmp_path / "m"))
+
+
+def test_autoguidance_on_a_card_is_at_least_1(persist, model, tmp_path):
+    assert persist("export", model, "--out", tmp_path / "m").code == 0
+    card = without_sums(tmp_path / "m") / "persist.json"
+    values = json.loads(card.read_text())
+    card.write_text(json.dumps(values | {"sampling": values["sampling"] | {"autoguidance": 0.5}}))
+    ended = persist("inspect", tmp_path / "m")
+    assert (ended.code, "and autoguidance, at least 1" in ended.err) == (1, True), ended.err
+
+
+def refused(persist, runs, *arguments):
+    """The one line by which an export with these arguments ends."""
+    ended = persist("export", runs / "stage1", *arguments, "--out", runs / "refused")
+    assert (ended.code, len(ended.err.strip().splitlines())) == (1, 1), ended.err
+    assert not (runs / "refused").exists()
+    return ended.err
+
+
+def test_what_cannot_guide_is_one_line(persist, runs):
+    assert "has another codec" in refused(persist, runs, "--guide", runs / "other-base")
+    write_base(runs / "deep", transformer=MICRO["transformer"] | {"num_layers": 3})
+    assert "a guide has the sizes of its base; another is transformer" in refused(
+        persist, runs, "--guide", runs / "deep"
+    )
+    assert "this checkpoint has no guide; persist export --guide" in refused(persist, runs, "--autoguidance", 2)
+    assert "no checkpoint there" in refused(persist, runs, "--guide", runs / "nowhere")
+
+
+def test_a_guide_of_other_settings_is_told(persist, runs, tmp_path):
+    card = runs / "weaker" / "persist.json"
+    values = json.loads(card.read_text())
+    changed = values | {"settings": values["settings"] | {"given": "rendered"}}
+    without_sums(runs / "weaker")
+    card.write_text(json.dumps(changed))
+    try:
+        ended = persist("export", runs / "stage1", "--guide", runs / "weaker", "--out", tmp_path / "m")
+    finally:
+        card.write_text(json.dumps(values))
+    assert ended.code == 0, ended.err
+    assert "the guide has other settings than its base: given" in ended.err
