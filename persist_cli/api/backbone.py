@@ -69,6 +69,7 @@ class Backbone(nn.Module, ABC):
     never_sharded: ClassVar[tuple[str, ...]] = ()  # submodules that work outside of ``forward`` and are never sharded
     built_by: ClassVar[tuple[str, ...]] = ()  # settings that say how it is built, which a base has its own of
     video_model: ClassVar[tuple[str, ...]] = ()  # files and folders of ``save_base`` that an export keeps of a guide
+    for_training: ClassVar[tuple[str, ...]] = ()  # settings of losses, in which a guide may differ from its model
     name: str = ""  # set by the registry
 
     def __init__(self, settings: Any) -> None:
@@ -112,7 +113,9 @@ class Backbone(nn.Module, ABC):
         if not 0 <= sampling.context_noise < math.inf:
             raise PersistError(f"context noise of {sampling.context_noise}; it must be a number of at least 0")
         if not 1 <= sampling.autoguidance < math.inf:
-            raise PersistError(f"autoguidance of {sampling.autoguidance}; it must be a number of at least 1, for none")
+            raise PersistError(
+                f"autoguidance of {sampling.autoguidance}; it must be a number of at least 1; 1 means none"
+            )
         if sampling.autoguidance != 1 and self.guide_folder is None:
             raise PersistError(
                 f"autoguidance of {sampling.autoguidance:g}: this checkpoint has no guide; persist export --guide "

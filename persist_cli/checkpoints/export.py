@@ -14,7 +14,7 @@ import torch
 
 from persist_cli import __version__
 from persist_cli.api.backbone import Sampling
-from persist_cli.api.checkpoint import CODEC_ALONE, GUIDE, PLAIN, Checkpoint, find_checkpoint, lora_base
+from persist_cli.api.checkpoint import CODEC_ALONE, GUIDE, PLAIN, Checkpoint, find_checkpoint, lora_base, read_card
 from persist_cli.api.inference import SamplingOverrides
 from persist_cli.api.scene import Scene
 from persist_cli.api.training_scenes import TrainingScenes
@@ -27,7 +27,7 @@ from persist_cli.checkpoints.exported_files import (
     summed_files,
     without_absolute_paths,
 )
-from persist_cli.checkpoints.guides import find_guide
+from persist_cli.checkpoints.guides import check_guide, guide_files
 from persist_cli.checkpoints.lineage import (
     ADAPTERS,
     MEMORY_FILE,
@@ -126,7 +126,9 @@ def run_export(plan: ExportPlan, out: Path, json: bool) -> None:
         return
     adapters = _find_adapters(base, plan.runs)
     base = _sampled_as(adapters, base, plan.sampling)
-    guide = find_guide(plan.guide, base) if plan.guide else {}
+    guide = find_checkpoint(plan.guide) if plan.guide else None
+    if guide is not None:
+        check_guide(guide, base)
     defaults = {
         "dtype": plan.dtype,
         "default_adapter": _default_adapter(base, adapters, plan.default),
@@ -134,12 +136,14 @@ def run_export(plan: ExportPlan, out: Path, json: bool) -> None:
     }
     protocols = _protocol_sampling(base, plan)
     defaults |= {"protocol_sampling": protocols} if protocols else {}
-    scenes = training_scenes(base) | (training_scenes(find_checkpoint(plan.guide)) if plan.guide else TrainingScenes())
-    for adapter in adapters.values():
-        scenes |= training_scenes(adapter.checkpoint)
+    defaults |= _guide_json(base, guide)
+    scenes = training_scenes(base)
+    for checkpoint in (*(adapter.checkpoint for adapter in adapters.values()), *([guide] if guide else [])):
+        scenes |= training_scenes(checkpoint)
     with folder_aside(out) as folder:
         with _merged_base(base, folder) as home:
-            _write_checkpoint(folder, home, adapters, guide, PRECISIONS[plan.dtype])
+            files = guide_files(guide, base) if guide else {}
+            _write_checkpoint(folder, home, adapters, files, PRECISIONS[plan.dtype])
         save_stage_recipes(folder, _recipes(base, adapters))
         written = _write_card(folder, base, defaults, scenes)
     print_files(out, {"fingerprint": written} | defaults, summed_files(out), json)
@@ -276,7 +280,8 @@ def _sampled_as(adapters: Mapping[str, AdapterSource], base: Checkpoint, request
     if len(set(samplings.values())) > 1:
         words = ", ".join(f"{name} {sampling.words}" for name, sampling in samplings.items())
         raise CheckpointError(
-            f"an export has one sampling, its adapters ask for several: {words}; give --steps, --sampler and --guidance"
+            f"an export has one sampling, its adapters ask for several: {words}; give --steps, --sampler and what else "
+            "they differ in"
         )
     if not adapters:
         return base
@@ -303,6 +308,13 @@ def _check_sampling(base: Checkpoint, plan: ExportPlan, sampling: Sampling) -> N
     backbone = empty_backbone(base)
     backbone.guide_folder = plan.guide or backbone.guide_folder
     backbone.check_sampling(sampling)
+
+
+def _guide_json(base: Checkpoint, guide: Checkpoint | None) -> dict[str, Any]:
+    """What a card says of the guide: which it is, by its fingerprint; nothing where there is none."""
+    kept = read_card(base.base_folder).get(GUIDE)
+    written = {"fingerprint": guide.fingerprint} if guide is not None else kept
+    return {} if written is None else {GUIDE: written}
 
 
 def _protocol_sampling(base: Checkpoint, plan: ExportPlan) -> dict[str, dict[str, Any]]:

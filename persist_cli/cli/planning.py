@@ -78,7 +78,7 @@ def plan(
         start=start, goal=goal, memory=memory, adapter=adapter, method=method, policy=policy, cost=cost, over=over,
         horizon=horizon, candidates=candidates, rounds=rounds, actions=split_names(actions), frames=frames,
         seconds=seconds, batch=batch, body=body, seed=seed, settings=tuple(settings or ()), step=step, turn=turn,
-        sampling=SamplingOverrides(steps, sampler, guidance, context_noise, autoguidance=1.0),
+        sampling=SamplingOverrides(steps, sampler, guidance, context_noise),
         placement=InferenceOptions.of(dtype, save_memory),
     )  # fmt: skip
     run_plan(checkpoint, options, out, json)

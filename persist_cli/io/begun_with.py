@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
 from persist_cli.errors import PersistError
+
+# keys that earlier versions did not write, with the value that they stood for; None: they looked at no such thing
+ADDED: Final = {"adapter_settings": None, "autoguidance": 1.0}
 
 
 def check_same(earlier: Any, now: Any, refusal: str) -> None:
     """Raise ``PersistError`` when a folder was begun with other values than those of now.
 
-    A checkpoint that was moved is the same one: where a fingerprint stands, the path beside it does not count.
+    A checkpoint that was moved is the same one: where a fingerprint stands, the path beside it does not count. What an
+    earlier version did not write is not compared.
 
     Args:
         earlier: JSON values that the folder holds.
         now: JSON values.
         refusal: the beginning of the error's line.
     """
-    earlier, now = _wherever_it_lies(earlier), _wherever_it_lies(now)
+    earlier, now = _wherever_it_lies(earlier), _as_earlier(_wherever_it_lies(earlier), _wherever_it_lies(now))
     if earlier != now:
         raise PersistError(f"{refusal} ({first_difference(earlier, now)}); choose another --out or delete it")
 
@@ -31,6 +35,16 @@ def _wherever_it_lies(values: Any) -> Any:
             if not (key == "path" and "fingerprint" in values)
         }
     return [_wherever_it_lies(value) for value in values] if isinstance(values, list) else values
+
+
+def _as_earlier(earlier: Any, now: Any) -> Any:
+    """Return the values of now without what an earlier version of persist did not write yet."""
+    if isinstance(earlier, dict) and isinstance(now, dict):
+        added = {key for key in {*now} - {*earlier} if key in ADDED and ADDED[key] in (None, now[key])}
+        return {key: _as_earlier(earlier.get(key), value) for key, value in now.items() if key not in added}
+    if isinstance(earlier, list) and isinstance(now, list) and len(earlier) == len(now):
+        return [_as_earlier(*pair) for pair in zip(earlier, now, strict=True)]
+    return now
 
 
 def first_difference(earlier: Any, new: Any, where: str = "") -> str:

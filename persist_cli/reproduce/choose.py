@@ -174,7 +174,8 @@ def eval_command(plan: Plan, memory: str, name: str, sampling: Sampling) -> str:
     """The command line that measures a trial on the validation houses."""
     data = " ".join(f"--data {shlex.quote(str(folder))}" for folder in plan.validation)
     options = f"--memories {memory} --controls '' --metrics psnr,lpips-alex --frames 9 --seeds 1 --clips {plan.clips}"
-    sampled = f"--steps {sampling.steps} --sampler {sampling.sampler} --guidance {sampling.memory_guidance:g}"
+    guidance = f"--guidance {sampling.memory_guidance:g} --autoguidance 1"
+    sampled = f"--steps {sampling.steps} --sampler {sampling.sampler} {guidance}"
     run, out = (shlex.quote(str(folder)) for folder in (
         run_folder(plan, memory, name), result_folder(plan, memory, name, sampling)
     ))  # fmt: skip

@@ -12,6 +12,7 @@ from torch import Tensor
 from persist_backbones.cogvideox.cogvideox import CogVideoX
 from persist_backbones.cogvideox.model import WorldTransformer
 from persist_cli.api.backbone import Sampling
+from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError, PersistError
 from tests.support.micro_model import equal, micro, random_clips, random_tokens, shaken, trained
 from tests.support.micro_runs import MICRO
@@ -22,6 +23,7 @@ THREE = Sampling(4, autoguidance=3.0)
 def model_and_guide(folder: Path) -> CogVideoX:
     """A model with an adapter that knows where its guide is, whose video model has other weights."""
     model = trained()
+    folder.mkdir(exist_ok=True)
     model.save_base(folder)
     guide = micro()
     guide.load_base(folder)
@@ -32,7 +34,7 @@ def model_and_guide(folder: Path) -> CogVideoX:
 
 
 def predictions(
-    model: CogVideoX, sampling: Sampling, monkeypatch: pytest.MonkeyPatch
+    model: CogVideoX, sampling: Sampling, monkeypatch: pytest.MonkeyPatch, tokens: MemoryTokens | None = None
 ) -> list[tuple[str, float, Tensor]]:
     """Who predicted what at which timestep while a clip was sampled; ``guided`` is what the sampler took."""
     seen: list[tuple[str, float, Tensor]] = []
@@ -51,18 +53,19 @@ def predictions(
 
     monkeypatch.setattr(WorldTransformer, "predict", predict)
     monkeypatch.setattr(type(model), "predict_guided", predict_guided)
-    model.generate(random_clips(1), sampling)
+    model.generate(random_clips(1, tokens), sampling)
     return seen
 
 
 def test_it_goes_beyond_the_guide_at_the_noisier_half_of_the_levels(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seen = predictions(model_and_guide(tmp_path), THREE, monkeypatch)
+    seen = predictions(model_and_guide(tmp_path), Sampling(8, autoguidance=3.0), monkeypatch)
     by_level: dict[float, dict[str, Tensor]] = {}
     for name, timestep, made in seen:
         by_level.setdefault(timestep, {})[name] = made
-    assert len(by_level) == 4
+    assert [timestep for timestep in by_level if timestep >= 500] == [999.0, 874.0, 749.0, 624.0]
+    assert len(by_level) == 8
     for timestep, made in by_level.items():
         if timestep >= 500:
             torch.testing.assert_close(made["guided"], made["guide"] + 3 * (made["model"] - made["guide"]))
@@ -70,7 +73,6 @@ def test_it_goes_beyond_the_guide_at_the_noisier_half_of_the_levels(
         else:
             assert set(made) == {"model", "guided"}
             assert torch.equal(made["guided"], made["model"])
-    assert {timestep >= 500 for timestep in by_level} == {True, False}
 
 
 def test_a_guide_that_is_the_model_itself_changes_nothing(tmp_path: Path) -> None:
@@ -82,17 +84,36 @@ def test_a_guide_that_is_the_model_itself_changes_nothing(tmp_path: Path) -> Non
     torch.testing.assert_close(with_guide, without)
 
 
-def test_the_guide_is_no_part_of_the_model_and_is_told_the_memory(tmp_path: Path) -> None:
+def test_the_guide_is_told_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = model_and_guide(tmp_path)
-    before = {name: value.clone() for name, value in model.state_dict().items()}
-    clips = random_clips(1), random_clips(1, random_tokens(1, 5))
-    alone, remembering = (model.generate(clip, THREE)[0] for clip in clips)
-    assert not torch.equal(alone, remembering)
-    assert before.keys() == model.state_dict().keys()
-    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
-    plain = model.generate(clips[0], Sampling(4))
-    assert equal(plain, model.generate(clips[0], Sampling(4)))
-    assert not torch.equal(plain[0], alone)
+    guides = []
+    for tokens in (None, random_tokens(1, 5)):
+        with monkeypatch.context() as patch:
+            seen = predictions(model, Sampling(1, autoguidance=3.0), patch, tokens)
+        guides += [made for name, _, made in seen if name == "guide"]
+    assert len(guides) == 2
+    assert not torch.equal(*guides)
+
+
+def test_the_guide_is_no_part_of_the_model_and_its_loading_draws_nothing(tmp_path: Path) -> None:
+    model, clips = model_and_guide(tmp_path), random_clips(1)
+    plain, names = model.generate(clips, Sampling(4)), [*model.state_dict()]
+    torch.manual_seed(7)
+    expected = torch.rand(3)
+    torch.manual_seed(7)
+    assert not torch.equal(model.generate(clips, THREE)[0], plain[0])
+    assert torch.equal(torch.rand(3), expected)
+    assert [*model.state_dict()] == names
+    assert equal(model.generate(clips, Sampling(4)), plain)
+
+
+def test_another_folder_is_another_guide(tmp_path: Path) -> None:
+    model, clips = model_and_guide(tmp_path / "one"), random_clips(1)
+    one = model.generate(clips, THREE)
+    (tmp_path / "own").mkdir()
+    model.save_base(tmp_path / "own")
+    model.guide_folder = tmp_path / "own"
+    assert not torch.equal(model.generate(clips, THREE)[0], one[0])
 
 
 def test_weights_of_half_precision_have_a_guide_of_half_precision(tmp_path: Path) -> None:
@@ -100,7 +121,7 @@ def test_weights_of_half_precision_have_a_guide_of_half_precision(tmp_path: Path
     model.generate(random_clips(1), THREE)
     model.to(torch.bfloat16)
     rgb, _ = model.generate(random_clips(1), THREE)
-    assert {value.dtype for value in model.guides[0].parameters()} == {torch.bfloat16}  # type: ignore[index]
+    assert {value.dtype for value in model.guides[tmp_path].parameters()} == {torch.bfloat16}  # type: ignore[index]
     assert len(rgb.unique()) > 2
 
 

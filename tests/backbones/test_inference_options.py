@@ -73,6 +73,16 @@ def test_an_offloaded_backbone_leaves_the_gpu_empty_between_clips(offload):
     assert backbone.transformer.base.device.type == "cuda"
 
 
+@pytest.mark.gpu
+def test_a_guide_leaves_the_gpu_with_the_weights_that_are_offloaded(tmp_path):
+    backbone = trained()
+    backbone.save_base(tmp_path)
+    backbone.guide_folder = tmp_path
+    backbone.prepare_inference(InferenceOptions(offload="model"))
+    backbone.generate(CLIPS, Sampling(2, autoguidance=2.0))
+    assert backbone.guides[tmp_path].base.device.type == "cpu"
+
+
 @pytest.mark.parametrize("scale", [1, 4, 8])
 def test_tiles_overlap_by_whole_latent_pixels(scale):
     for tile in range(2, 120):

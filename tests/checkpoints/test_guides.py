@@ -8,7 +8,9 @@ import pytest
 import torch
 
 from persist_cli.api.backbone import Sampling
-from persist_cli.api.checkpoint import find_checkpoint
+from persist_cli.api.checkpoint import find_checkpoint, read_card
+from persist_cli.api.training_scenes import TrainingScenes
+from persist_cli.checkpoints.lineage import training_scenes
 from persist_cli.checkpoints.load import load_backbone
 from persist_cli.checkpoints.save import save_base
 from persist_cli.errors import CheckpointError
@@ -53,17 +55,32 @@ def test_an_export_of_an_export_keeps_its_guide_and_another_one_takes_its_place(
     assert persist("export", model, "--dtype", "float32", "--out", tmp_path / "again").code == 0
     assert torch.equal(clip(tmp_path / "again", 3.0), clip(model, 3.0))
     assert find_checkpoint(tmp_path / "again").fingerprint == find_checkpoint(model).fingerprint
-    assert persist("export", model, "--guide", runs / "stage1", "--dtype", "float32", "--out", tmp_path / "m").code == 0
-    torch.testing.assert_close(clip(tmp_path / "m", 3.0), clip(model, 1.0), atol=1, rtol=0)  # guided by itself
-    assert find_checkpoint(tmp_path / "m").fingerprint != find_checkpoint(model).fingerprint
+    other = write_weaker(runs / "stage1", tmp_path / "other", 0.05)
+    assert persist("export", model, "--guide", other, "--dtype", "float32", "--out", tmp_path / "m").code == 0
+    assert not torch.equal(clip(tmp_path / "m", 3.0), clip(model, 3.0))
+    assert torch.equal(clip(tmp_path / "m", 1.0), clip(model, 1.0))
+    cards = [read_card(folder)["guide"] for folder in (model, tmp_path / "again", tmp_path / "m")]
+    guides = [{"fingerprint": find_checkpoint(folder).fingerprint} for folder in (runs / "weaker", other)]
+    assert cards == [guides[0], guides[0], guides[1]]
 
 
-def test_a_stage_1_that_is_trained_on_has_neither_guide_nor_autoguidance(model, tmp_path):
+def test_a_stage_1_that_is_trained_on_has_neither_guide_nor_autoguidance(persist, model, tmp_path):
+    assert persist("export", model, "--sampling-for", "return:autoguidance=2", "--out", tmp_path / "m").code == 0
     (tmp_path / "on").mkdir()
-    base = find_checkpoint(model)
+    base = find_checkpoint(tmp_path / "m")
     save_base(load_backbone(base), tmp_path / "on", base=base)
-    assert find_checkpoint(tmp_path / "on").sampling == Sampling(4)
+    trained_on = find_checkpoint(tmp_path / "on")
+    assert base.protocol_sampling == {"return": Sampling(4, autoguidance=2.0)}
+    assert (trained_on.sampling, trained_on.protocol_sampling) == (Sampling(4), {"return": Sampling(4)})
     assert not (tmp_path / "on" / "guide").exists()
+
+
+def test_scenes_that_a_guide_was_trained_on_are_those_of_the_export(persist, runs, tmp_path):
+    (tmp_path / "weaker").mkdir()
+    scenes = TrainingScenes(frozenset({"seen-by-the-guide"}))
+    save_base(load_backbone(find_checkpoint(runs / "weaker")), tmp_path / "weaker", scenes)
+    assert persist("export", runs / "stage1", "--guide", tmp_path / "weaker", "--out", tmp_path / "m").code == 0
+    assert "seen-by-the-guide" in training_scenes(find_checkpoint(tmp_path / "m")).names
 
 
 def test_a_damaged_guide_is_told_when_the_model_is_loaded(persist, model, tmp_path):
@@ -92,24 +109,32 @@ def refused(persist, runs, *arguments):
 
 
 def test_what_cannot_guide_is_one_line(persist, runs):
+    assert "its video model is the base itself" in refused(persist, runs, "--guide", runs / "stage1")
+    assert "its video model is the base itself" in refused(persist, runs, "--guide", runs / "voxel")
     assert "has another codec" in refused(persist, runs, "--guide", runs / "other-base")
-    write_base(runs / "deep", transformer=MICRO["transformer"] | {"num_layers": 3})
-    assert "a guide has the sizes of its base; another is transformer" in refused(
-        persist, runs, "--guide", runs / "deep"
-    )
     assert "this checkpoint has no guide; persist export --guide" in refused(persist, runs, "--autoguidance", 2)
     assert "no checkpoint there" in refused(persist, runs, "--guide", runs / "nowhere")
+    assert persist("export", runs / "stage1", "--codec", "--out", runs / "codec").code == 0
+    assert "a codec alone" in refused(persist, runs, "--guide", runs / "codec")
 
 
-def test_a_guide_of_other_settings_is_told(persist, runs, tmp_path):
-    card = runs / "weaker" / "persist.json"
-    values = json.loads(card.read_text())
-    changed = values | {"settings": values["settings"] | {"given": "rendered"}}
-    without_sums(runs / "weaker")
-    card.write_text(json.dumps(changed))
-    try:
-        ended = persist("export", runs / "stage1", "--guide", runs / "weaker", "--out", tmp_path / "m")
-    finally:
-        card.write_text(json.dumps(values))
-    assert ended.code == 0, ended.err
-    assert "the guide has other settings than its base: given" in ended.err
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("transformer.num_layers", {"transformer": MICRO["transformer"] | {"num_layers": 3}}),
+        ("interactions", {"interactions": ("open",)}),
+        ("image_noise", {"image_noise": 0.5}),
+        ("depth", {"depth": False}),
+        ("given", {"given": "rendered"}),
+    ],
+)
+def test_a_guide_has_the_settings_of_its_base(persist, runs, name, settings, tmp_path):
+    write_base(tmp_path / "other", **settings)
+    assert f"another {name} than" in refused(persist, runs, "--guide", tmp_path / "other")
+
+
+def test_a_guide_may_have_another_loss(persist, runs, tmp_path):
+    (tmp_path / "weaker").mkdir()
+    backbone = load_backbone(find_checkpoint(runs / "weaker"), {"weighting": "min-snr"})
+    save_base(backbone, tmp_path / "weaker")
+    assert persist("export", runs / "stage1", "--guide", tmp_path / "weaker", "--out", tmp_path / "m").code == 0

@@ -22,6 +22,16 @@ def test_another_checkpoint_in_the_same_place_is_refused():
         check_same(plan("/data/voxel", "1f"), plan("/data/voxel", "2e"), "runs/eval: holds another evaluation")
 
 
+def test_what_an_earlier_version_did_not_write_is_not_compared():
+    earlier, settings = plan("/data/voxel", "1f"), {"adapter_settings": {"voxel": "3a"}}
+    now = earlier | {"models": [{"path": "/data/voxel", "fingerprint": "1f"} | settings], "autoguidance": 1.0}
+    check_same(earlier, now, "runs/eval: holds another evaluation")
+    with pytest.raises(PersistError, match=r"another evaluation .*autoguidance: None, now 2"):
+        check_same(earlier, now | {"autoguidance": 2.0}, "runs/eval: holds another evaluation")
+    with pytest.raises(PersistError, match=r"another evaluation .*voxel: 3a, now 4b"):
+        check_same(settings, {"adapter_settings": {"voxel": "4b"}}, "runs/eval: holds another evaluation")
+
+
 def test_a_path_without_a_fingerprint_counts():
     with pytest.raises(PersistError, match="path: a, now b"):
         check_same({"path": "a"}, {"path": "b"}, "runs/eval: holds another evaluation")

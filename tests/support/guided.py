@@ -10,10 +10,10 @@ from persist_cli.checkpoints.save import save_base
 from tests.support.micro_model import shaken
 
 
-def write_weaker(stage1: Path, folder: Path) -> Path:
+def write_weaker(stage1: Path, folder: Path, scale: float = 0.02) -> Path:
     """Write a stage 1 on the same codec whose video model has other weights; returns its folder."""
     backbone = load_backbone(find_checkpoint(stage1))
-    shaken(backbone.transformer, 0.02)  # type: ignore[arg-type]
+    shaken(backbone.transformer, scale)  # type: ignore[arg-type]
     folder.mkdir()
     save_base(backbone, folder)
     return folder

@@ -19,7 +19,7 @@ from persist_backbones.adapters.base import Adapter, AdapterCondition, MemoryCon
 from persist_backbones.cogvideox.adapted import AdaptedBackbone
 from persist_backbones.cogvideox.codec import Codec, frames_to_batch, to_uint8
 from persist_backbones.cogvideox.codec_start import start_as_components
-from persist_backbones.cogvideox.config import CogVideoXSettings
+from persist_backbones.cogvideox.config import LOSS_SETTINGS, CogVideoXSettings
 from persist_backbones.cogvideox.diffusion import (
     SAMPLERS,
     DrawTimesteps,
@@ -83,6 +83,7 @@ class CogVideoX(AdaptedBackbone):
     never_sharded = ("codec",)
     built_by = ("transformer", "prediction", "vae")
     video_model = ("transformer", "world.safetensors")
+    for_training = LOSS_SETTINGS
     settings: CogVideoXSettings
     prompt: Tensor
 

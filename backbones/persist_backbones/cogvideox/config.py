@@ -92,6 +92,10 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     },
 }
 
+LOSS_SETTINGS = (  # settings of losses and of codecs in training, which change nothing of how a model is sampled
+    "weighting", "snr_gamma", "channel_weights", "kl_weight", "codec_window", "codec_start", "codec_trains",
+)  # fmt: skip
+
 
 @dataclass(frozen=True)
 class CogVideoXSettings:

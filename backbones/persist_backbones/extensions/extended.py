@@ -48,7 +48,7 @@ class ExtendedCogVideoX(CogVideoX):
         self.frozen = FrozenWeights(self, None)
         self.offloaded: OffloadedParts | None = None
         self.caches: ClipCaches | None = None  # while a clip is sampled
-        self.guides: list[WorldTransformer] = []  # one at most, once loaded; in a list it is no part of the model
+        self.guides: dict[Path, WorldTransformer] = {}  # those that were needed, by folder; no part of the model
         self.autoguidance: Autoguidance | None = None  # while a clip is sampled
         self.distillation: Distillation | None = None
         self.adversarial: Adversarial | None = None
@@ -100,6 +100,8 @@ class ExtendedCogVideoX(CogVideoX):
             self.autoguidance = self.guidance_of(sampling)
             return super().sample(first, sampling, on_step, generators, noise)
         finally:
+            if self.autoguidance is not None and self.offloaded is not None:
+                self.autoguidance.guide.to("cpu")
             self.autoguidance = None
             if self.caches is not None:
                 self.caches.forget()
@@ -110,9 +112,10 @@ class ExtendedCogVideoX(CogVideoX):
         if sampling.autoguidance == 1:
             return None
         self.check_sampling(sampling)
-        if not self.guides and self.guide_folder is not None:
-            self.guides.append(load_guide(self, self.guide_folder))
-        return Autoguidance(self, self.guides[0], sampling.autoguidance)
+        assert self.guide_folder is not None  # as was checked
+        if self.guide_folder not in self.guides:
+            self.guides[self.guide_folder] = load_guide(self, self.guide_folder)
+        return Autoguidance(self, self.guides[self.guide_folder], sampling.autoguidance)
 
     def predict_guided(self, noisy: Tensor, image: Tensor, conditions: Conditions, guidance: float) -> Tensor:
         """Predict with guidance over memory, and away from the guide."""
