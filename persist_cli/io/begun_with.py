@@ -21,7 +21,8 @@ def check_same(earlier: Any, now: Any, refusal: str) -> None:
         now: JSON values.
         refusal: the beginning of the error's line.
     """
-    earlier, now = _wherever_it_lies(earlier), _as_earlier(_wherever_it_lies(earlier), _wherever_it_lies(now))
+    earlier, now = _wherever_it_lies(earlier), _wherever_it_lies(now)
+    now = _as_earlier(earlier, now)
     if earlier != now:
         raise PersistError(f"{refusal} ({first_difference(earlier, now)}); choose another --out or delete it")
 

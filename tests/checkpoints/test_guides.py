@@ -15,8 +15,7 @@ from persist_cli.checkpoints.load import load_backbone
 from persist_cli.checkpoints.save import save_base
 from persist_cli.errors import CheckpointError
 from tests.support.damage import without_sums
-from tests.support.export_runs import write_base, write_runs
-from tests.support.guided import write_weaker
+from tests.support.export_runs import write_base, write_runs, write_weaker
 from tests.support.micro_model import random_clips
 from tests.support.micro_runs import MICRO, run_persist
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from persist_cli.api.backbone import Backbone
 from persist_cli.api.checkpoint import find_checkpoint
+from persist_cli.checkpoints.load import load_backbone
 from persist_cli.checkpoints.save import save_adapter, save_base
 from persist_cli.recipe import MemoryConfig
 from tests.support.micro_model import CHANNELS, micro, shaken
@@ -23,6 +24,15 @@ def write_base(folder: Path, scale: float = 0.1, **settings: Any) -> Backbone:
     folder.mkdir(parents=True)
     save_base(backbone, folder)
     return backbone
+
+
+def write_weaker(stage1: Path, folder: Path, scale: float = 0.02) -> Path:
+    """Write a stage 1 on the same codec whose video model has other weights; returns its folder."""
+    backbone = load_backbone(find_checkpoint(stage1))
+    shaken(backbone.transformer, scale)  # type: ignore[arg-type]
+    folder.mkdir()
+    save_base(backbone, folder)
+    return folder
 
 
 def write_adapter(backbone: Backbone, base: Path, folder: Path, memory: str, form: str = "cross") -> Path:
