@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from persist_cli.api.checkpoint import Checkpoint, lora_base
 from persist_cli.checkpoints.load import changed_settings, is_own_codec, load_backbone, takes_codec_alone
 from persist_cli.errors import CheckpointError
+from persist_cli.io.checksums import tensor_checksum
+from persist_cli.io.files import read_tensors
 from persist_cli.output.console import busy
 from persist_cli.plugins import load_plugin
 
@@ -17,6 +20,12 @@ def guide_files(guide: Checkpoint, base: Checkpoint) -> dict[str, Path]:
     names = load_plugin("backbone", base.backbone).video_model
     parts = [path for name in names for path in (home / name, *(home / name).rglob("[!.]*"))]
     return {path.relative_to(home).as_posix(): path for path in sorted(parts) if path.is_file()}
+
+
+def _weights(files: Mapping[str, Path]) -> dict[str, str]:
+    """The checksums of the weights in some files by their names, however they are cut into files."""
+    tensors = (read_tensors(path)[0] for name, path in files.items() if name.endswith(".safetensors"))
+    return {name: tensor_checksum({name: tensor}, {}) for part in tensors for name, tensor in part.items()}
 
 
 def check_guide(guide: Checkpoint, base: Checkpoint) -> None:
@@ -37,7 +46,7 @@ def check_guide(guide: Checkpoint, base: Checkpoint) -> None:
     changed = [name for name in changed_settings(base.settings, guide.settings) if name not in kind.for_training]
     if changed:
         raise CheckpointError(f"{place}: another {changed[0]} than {base.folder}; a guide has the settings of its base")
-    if guide.fingerprint == base.fingerprint:
+    if _weights(guide_files(guide, base)) == _weights(guide_files(base, base)):
         raise CheckpointError(f"{place}: its video model is the base itself; a guide is a weaker version, trained less")
     with busy("comparing the codecs"):
         encodings = {load_backbone(checkpoint).encoding() for checkpoint in (guide, base)}

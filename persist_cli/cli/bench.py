@@ -34,7 +34,8 @@ PLAN_MEMORIES = "none,voxel,simulator"
 
 bench_app = typer.Typer(no_args_is_help=True, help="Measure plans, collisions and imagined scenes in held-out houses.")
 
-RENDERING = ("checkpoint", "denoising_steps", "sampler", "guidance", "dtype", "save_memory")  # of what draws scenes
+# options of what draws scenes
+RENDERING = ("checkpoint", "denoising_steps", "sampler", "guidance", "autoguidance", "dtype", "save_memory")
 
 OF_PARTS = {  # parts of `bench scene` that have a use for options
     "seeds": ("completion", "walk", "return", "evolution"),
@@ -186,8 +187,8 @@ def bench_plan(
     approach: Annotated[bool, typer.Option(help="Go to the best imagined view of a goal in sight, then stop.")] = True,
     explore: Annotated[bool, typer.Option(help="Plans that end where the agent has looked already come last.")] = True,
     steps: StepsOption = None, sampler: SamplerOption = None, guidance: GuidanceOption = None,
-    dtype: DtypeOption = None, save_memory: SaveMemoryOption = None, verify: VerifyOption = False,
-    allow_training_scenes: TrainingScenesOption = False,
+    autoguidance: AutoguidanceOption = None, dtype: DtypeOption = None, save_memory: SaveMemoryOption = None,
+    verify: VerifyOption = False, allow_training_scenes: TrainingScenesOption = False,
     out: Annotated[Path, typer.Option(help="Folder of all results; a stopped run goes on.")] = Path("runs/bench-plan"),
     report: Annotated[Path | None, typer.Option(help="Folder for report.html and maps.")] = None,
     json: JsonOption = False,
@@ -206,8 +207,8 @@ def bench_plan(
         source=episode_source(episodes, scenes, bins, each), checkpoint=checkpoint, policy=policy, cost=cost,
         rows=split_names(rows) if rows else None, memories=split_names(memories), loops=split_names(loops),
         planning=planning, loop=run_episode.LoopSettings(execute, patience, max_actions=max_actions),
-        stop_cost=stop_cost, allow_training_scenes=allow_training_scenes,
-        sampling=SamplingOverrides(steps, sampler, guidance), placement=InferenceOptions.of(dtype, save_memory),
+        sampling=SamplingOverrides(steps, sampler, guidance, autoguidance=autoguidance), stop_cost=stop_cost,
+        placement=InferenceOptions.of(dtype, save_memory), allow_training_scenes=allow_training_scenes,
     ), out, report, json)  # fmt: skip
 
 
@@ -230,17 +231,15 @@ def bench_scene(
     edits: Annotated[int, typer.Option(min=1, help="Random edits.")] = 100,
     interactions: Annotated[int, typer.Option(min=1, help="Most interactions of the data: evolution.")] = 100,
     denoising_steps: Annotated[int | None, typer.Option(min=1, help="Of the frames; the checkpoint's.")] = None,
-    sampler: SamplerOption = None,
-    guidance: GuidanceOption = None,
-    dtype: DtypeOption = None,
-    save_memory: SaveMemoryOption = None,
+    sampler: SamplerOption = None, guidance: GuidanceOption = None, autoguidance: AutoguidanceOption = None,
+    dtype: DtypeOption = None, save_memory: SaveMemoryOption = None,
     settings: Annotated[list[str] | None, typer.Option("--set", help="Of the scenes: memory.KEY=VALUE.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the choice of images and edits.")] = 0,
     allow_training_scenes: TrainingScenesOption = False,
     out: Annotated[Path, typer.Option(help="Folder of all results; a stopped run goes on.")] = Path("runs/bench-scene"),
     report: Annotated[Path | None, typer.Option(help="Folder for report.html with plans.")] = None,
     json: JsonOption = False,
-) -> None:
+) -> None:  # fmt: skip
     """Compare the scenes that a model imagines from one image with true houses, and with guesses without a model.
 
     persist bench scene runs/scene --data runs/test-houses --train runs/houses --out runs/bench-scene
@@ -251,10 +250,10 @@ def bench_scene(
     chosen, rendering = split_names(parts), None
     refuse_other_parts(context, chosen)
     if checkpoint is None:
-        unused = "memories return_steps denoising_steps sampler guidance dtype save_memory"
+        unused = "memories return_steps denoising_steps sampler guidance autoguidance dtype save_memory"
         refuse_options(context, unused, "only with --checkpoint, whose model draws scenes")
     else:
-        sampling = SamplingOverrides(denoising_steps, sampler, guidance)
+        sampling = SamplingOverrides(denoising_steps, sampler, guidance, autoguidance=autoguidance)
         placement = InferenceOptions.of(dtype, save_memory)
         rendering = RenderingPlan(checkpoint, split_names(memories), return_steps, sampling, placement)
     run_scene_bench(SceneBenchPlan(

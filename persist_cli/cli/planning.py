@@ -9,6 +9,7 @@ import typer
 
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.cli.options import (
+    AutoguidanceOption,
     BodyOption,
     ContextNoiseOption,
     DtypeOption,
@@ -31,6 +32,12 @@ from persist_cli.cli.options import (
 planning_app = typer.Typer()
 
 
+MethodOption = Annotated[str, typer.Option(help="rank: a policy proposes; cem: the best of a round lead the next.")]
+ProposingOption = Annotated[
+    str | None, typer.Option(help="Proposes: of `persist plugins`, or a trained one's folder. rank: random.")
+]
+
+
 @planning_app.command()
 def plan(
     start: Annotated[str, typer.Option(help="Where to start: DATA#trajectory:frame.")],
@@ -39,12 +46,8 @@ def plan(
     checkpoint: ReferenceArgument = None,
     memory: Annotated[Path | None, typer.Option(help="Memory file of the place.")] = None,
     adapter: Annotated[str | None, typer.Option(help="Memory adapter; else the only one or the default.")] = None,
-    method: Annotated[
-        str, typer.Option(help="rank: a policy proposes; cem: the best of a round lead the next.")
-    ] = "cem",
-    policy: Annotated[
-        str | None, typer.Option(help="Proposes: of `persist plugins`, or a trained one's folder. rank: random.")
-    ] = None,
+    method: MethodOption = "cem",
+    policy: ProposingOption = None,
     cost: Annotated[str | None, typer.Option(help="Of `persist plugins`; lpips, or geodesic to a place.")] = None,
     over: Annotated[str, typer.Option(help="Which frame counts: last, or the best of the clip.")] = "last",
     horizon: Annotated[int | None, typer.Option(min=1, help="Actions of a candidate; 8.")] = None,
@@ -63,6 +66,7 @@ def plan(
     sampler: SamplerOption = None,
     guidance: Annotated[float, typer.Option(min=0, help="Of guidance over memory; 1: none.")] = 1.0,
     context_noise: ContextNoiseOption = None,
+    autoguidance: Annotated[float, typer.Option(min=1, help="Away from the model's guide; 1: none.")] = 1.0,
     dtype: DtypeOption = None,
     save_memory: SaveMemoryOption = None,
     verify: VerifyOption = False,
@@ -78,7 +82,7 @@ def plan(
         start=start, goal=goal, memory=memory, adapter=adapter, method=method, policy=policy, cost=cost, over=over,
         horizon=horizon, candidates=candidates, rounds=rounds, actions=split_names(actions), frames=frames,
         seconds=seconds, batch=batch, body=body, seed=seed, settings=tuple(settings or ()), step=step, turn=turn,
-        sampling=SamplingOverrides(steps, sampler, guidance, context_noise),
+        sampling=SamplingOverrides(steps, sampler, guidance, context_noise, autoguidance),
         placement=InferenceOptions.of(dtype, save_memory),
     )  # fmt: skip
     run_plan(checkpoint, options, out, json)
@@ -106,17 +110,15 @@ def learn(
     patience: Annotated[float, typer.Option(min=1, help="Most actions, as a multiple of the shortest way's.")] = 4,
     stop_cost: Annotated[float, typer.Option(min=0, help="LPIPS of view and goal at which it stops there.")] = 0.17,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
-    steps: StepsOption = None,
-    sampler: SamplerOption = None,
-    guidance: GuidanceOption = None,
-    context_noise: ContextNoiseOption = None,
+    steps: StepsOption = None, sampler: SamplerOption = None, guidance: GuidanceOption = None,
+    context_noise: ContextNoiseOption = None, autoguidance: AutoguidanceOption = None,
     dtype: DtypeOption = None,
     save_memory: SaveMemoryOption = None,
     batch: Annotated[int, typer.Option(min=1, help="Walks imagined at once.")] = 16,
     allow_training_scenes: TrainingScenesOption = False,
     verify: VerifyOption = False,
     json: JsonOption = False,
-) -> None:
+) -> None:  # fmt: skip
     """Let a policy practise in a new house inside the model, learn from what it reached, and repeat.
 
     persist learn --views sample#0:0-24 --policy runs/policy --out runs/learn
@@ -132,6 +134,7 @@ def learn(
         practice=PracticeSettings(
             walks=walks, actions=actions, execute=execute, explore=explore, batch=batch, proposals=proposals),
         steps=training_steps, training=tuple(settings or ()), episodes=episodes, loop=LoopSettings(patience=patience),
-        sampling=SamplingOverrides(steps, sampler, guidance, context_noise), seed=seed, body=body, stop_cost=stop_cost,
-        placement=InferenceOptions.of(dtype, save_memory), allow_training_scenes=allow_training_scenes,
+        sampling=SamplingOverrides(steps, sampler, guidance, context_noise, autoguidance),
+        placement=InferenceOptions.of(dtype, save_memory), seed=seed, body=body, stop_cost=stop_cost,
+        allow_training_scenes=allow_training_scenes,
     ), out, json)  # fmt: skip

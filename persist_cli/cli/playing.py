@@ -47,6 +47,9 @@ PlayStepsOption = Annotated[
     int | None,
     typer.Option(min=1, max=50, help="Denoising steps; few answer a key soon. A distilled model's own, else 1."),
 ]
+PlayAutoguidanceOption = Annotated[
+    float, typer.Option("--autoguidance", min=1, max=10, help="Away from the model's guide, if it has one; 1: none.")
+]
 OpenOption = Annotated[
     bool | None, typer.Option("--open/--no-open", help="Open the browser, if there is one; not with --json.")
 ]
@@ -61,11 +64,10 @@ def play(
     depth: DepthOption = None,
     depth_model: DepthModelOption = None,
     fov: Annotated[float | None, typer.Option(help="Of a picture: degrees from its top to its bottom; 75.")] = None,
-    step: StepOption = None,
-    turn: TurnOption = None,
-    body: BodyOption = None,
+    step: StepOption = None, turn: TurnOption = None, body: BodyOption = None,
     steps: PlayStepsOption = None,
     guidance: Annotated[float, typer.Option(min=0, max=10, help="Of guidance over memory; 1: none.")] = 1.0,
+    autoguidance: PlayAutoguidanceOption = 1.0,
     seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of the sampling noise.")] = 0,
     clip_frames: ClipFramesOption = None,
     ahead: Annotated[bool, typer.Option(help="Imagine the likely next actions while no key is held.")] = True,
@@ -79,7 +81,7 @@ def play(
     save_memory: SaveMemoryOption = None,
     verify: VerifyOption = False,
     json: JsonOption = False,
-) -> None:
+) -> None:  # fmt: skip
     """Walk with the keys through what a model imagines, on a page in the browser, until Ctrl-C.
 
     persist play
@@ -98,7 +100,8 @@ def play(
     begin = StartOptions(start or SAMPLE_START, PictureOptions(depth, depth_model, fov, None), step, turn, body)
     options = PlayOptions(
         checkpoint=checkpoint or REFERENCE, begin=begin, memories=split_names(memories), given=given,
-        settings=PlaySettings(steps=steps or 1, guidance=guidance, seed=seed, ahead=ahead, clip_frames=clip_frames),
+        settings=PlaySettings(steps=steps or 1, guidance=guidance, autoguidance=autoguidance, seed=seed, ahead=ahead,
+            clip_frames=clip_frames),
         placement=InferenceOptions.of(dtype, save_memory), own_steps=steps is None,
     )  # fmt: skip
     opens, limits = (not json if browser is None else browser), Limits(sessions, fps)

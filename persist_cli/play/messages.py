@@ -4,7 +4,7 @@ The page sends JSON text of at most ``MOST_BYTES``, an object with a ``type``::
 
     {"type": "keys", "held": ["forward"]}             whenever the set of held actions changes
     {"type": "ack", "number": 7}                      after the frame with this number was drawn
-    {"type": "settings", "steps": 2}                  one setting or several: steps, guidance, seed, ahead
+    {"type": "settings", "steps": 2}                  one or several of those of ``Settings``
     {"type": "reset", "seed": 3}                      the start again, with an empty way; the seed may be left out
     {"type": "undo"}                                  one frame back
     {"type": "home"}                                  to the start pose; what was remembered stays
@@ -46,12 +46,14 @@ LENGTH: Final = struct.Struct(">I")  # of the header of a binary message
 
 MOST_STEPS: Final = 50
 MOST_GUIDANCE: Final = 10.0
+MOST_AUTOGUIDANCE: Final = 10.0
 MOST_SEED: Final = 2**31 - 1
 
 ActionName = Annotated[str, Field(pattern=r"^[a-z_]{1,32}$")]
 Metres = Annotated[float, Field(allow_inf_nan=False, ge=-1e6, le=1e6)]
 Steps = Annotated[int, Field(ge=1, le=MOST_STEPS)]
 Guidance = Annotated[float, Field(allow_inf_nan=False, ge=0, le=MOST_GUIDANCE)]
+Autoguidance = Annotated[float, Field(allow_inf_nan=False, ge=1, le=MOST_AUTOGUIDANCE)]
 Seed = Annotated[int, Field(ge=0, le=MOST_SEED)]
 
 
@@ -81,6 +83,7 @@ class ChangeSettings(FromPage):
     type: Literal["settings"] = "settings"
     steps: Steps | None = None
     guidance: Guidance | None = None
+    autoguidance: Autoguidance | None = None
     seed: Seed | None = None
     ahead: bool | None = None
 
@@ -193,6 +196,7 @@ class Settings(ToPage):
 
     steps: int
     guidance: float
+    autoguidance: float
     seed: int
     ahead: bool
 
@@ -207,7 +211,7 @@ class Welcome(ToPage):
         actions: those that may be held.
         image: width and height of each image in pixels.
         settings: as they are at the start.
-        limits: least and most of the settings that are numbers.
+        limits: least and most of the settings that are numbers; ``autoguidance`` where the model has a guide.
     """
 
     type: Literal["welcome"] = "welcome"
@@ -217,11 +221,13 @@ class Welcome(ToPage):
     actions: list[ActionKeys]
     image: tuple[int, int]
     settings: Settings
-    limits: dict[str, tuple[float, float]] = {
-        "steps": (1, MOST_STEPS),
-        "guidance": (0, MOST_GUIDANCE),
-        "seed": (0, MOST_SEED),
-    }
+    limits: dict[str, tuple[float, float]]
+
+
+def limits(guided: bool) -> dict[str, tuple[float, float]]:
+    """Return the least and the most of the settings that are numbers; ``guided``: whether the model has a guide."""
+    away = {"autoguidance": (1.0, MOST_AUTOGUIDANCE)} if guided else {}
+    return {"steps": (1, MOST_STEPS), "guidance": (0, MOST_GUIDANCE), **away, "seed": (0, MOST_SEED)}
 
 
 class State(ToPage):

@@ -95,6 +95,11 @@ class Play:
         stays = f", and {', '.join(readers)} cannot remember it" if readers else ""
         return (f"this model imagines no depth: what it imagines stops nobody{stays}",)
 
+    @property
+    def guided(self) -> bool:
+        """Whether the model has a guide, so that it can sample with autoguidance."""
+        return all(world.backbone.guide_folder is not None for world in self._walkers.worlds.values())
+
     def set(self, settings: PlaySettings) -> None:
         """Take other settings from the next clip on; what is imagined and not shown yet is dropped.
 
@@ -398,4 +403,6 @@ class Play:
 
     @staticmethod
     def _sampling(world: WorldModel, settings: PlaySettings) -> Sampling:
-        return dataclasses.replace(world.sampling, steps=settings.steps, memory_guidance=settings.guidance)
+        return dataclasses.replace(
+            world.sampling, steps=settings.steps, memory_guidance=settings.guidance, autoguidance=settings.autoguidance
+        )

@@ -232,12 +232,14 @@ class Presenter:
         ]
         return messages.Welcome(
             model=self.play.model, memories=list(self.play.memories), actions=actions, image=(width, height),
-            settings=self._settings(),
+            settings=self._settings(), limits=messages.limits(self.play.guided),
         )  # fmt: skip
 
     def _settings(self) -> messages.Settings:
         now = self.play.settings
-        return messages.Settings(steps=now.steps, guidance=now.guidance, seed=now.seed, ahead=now.ahead)
+        return messages.Settings(
+            steps=now.steps, guidance=now.guidance, autoguidance=now.autoguidance, seed=now.seed, ahead=now.ahead
+        )
 
     def _state(self) -> messages.State:
         play = self.play

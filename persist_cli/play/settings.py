@@ -23,11 +23,12 @@ GROWTH: Final = (2, 3, 5)  # frames of the first clips under newly held keys, th
 class PlaySettings:
     """How frames are imagined while somebody walks.
 
-    Fewer steps answer a key sooner; guidance doubles the time of each.
+    Fewer steps answer a key sooner; each guidance doubles the time of a step.
 
     Args:
         steps: denoising steps of a clip, at least 1.
         guidance: weight of guidance over memory, at least 0; 1 means none.
+        autoguidance: weight of guidance away from the checkpoint's guide, at least 1; 1 means none.
         seed: of the sampling noise.
         ahead: whether the likely next actions are imagined while no key is held. Where ``growing`` makes clips shorter,
             pictures differ somewhat by whether there was time for that.
@@ -39,6 +40,7 @@ class PlaySettings:
 
     steps: int = 1
     guidance: float = 1.0
+    autoguidance: float = 1.0
     seed: int = 0
     ahead: bool = True
     clip_frames: int | None = None
@@ -49,6 +51,8 @@ class PlaySettings:
             raise PersistError(f"{self.steps} denoising steps; it must be at least 1")
         if not 0 <= self.guidance < math.inf:
             raise PersistError(f"guidance over memory of {self.guidance}; it must be a number of at least 0")
+        if not 1 <= self.autoguidance < math.inf:
+            raise PersistError(f"autoguidance of {self.autoguidance}; it must be a number of at least 1")
         if self.seed < 0:
             raise PersistError(f"seed {self.seed}; it must be at least 0")
 

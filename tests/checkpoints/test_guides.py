@@ -13,7 +13,10 @@ from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.checkpoints.lineage import training_scenes
 from persist_cli.checkpoints.load import load_backbone
 from persist_cli.checkpoints.save import save_base
-from persist_cli.errors import CheckpointError
+from persist_cli.errors import CheckpointError, PersistError
+from persist_cli.play.open_play import PlayOptions, open_play
+from persist_cli.play.settings import PlaySettings
+from persist_cli.play.start import StartOptions
 from tests.support.damage import without_sums
 from tests.support.export_runs import write_base, write_runs, write_weaker
 from tests.support.micro_model import random_clips
@@ -74,6 +77,34 @@ def test_a_stage_1_that_is_trained_on_has_neither_guide_nor_autoguidance(persist
     assert not (tmp_path / "on" / "guide").exists()
 
 
+def test_who_walks_samples_away_from_the_guide_where_it_is_asked_for(model, runs, walks):
+    def seen(checkpoint, settings):
+        play = open_play(PlayOptions(checkpoint=checkpoint, begin=StartOptions(f"{walks}#0:2"), settings=settings))
+        assert play.guided == (checkpoint == model)
+        return play.advance({"forward"}).images["voxel"]
+
+    assert torch.equal(seen(model, PlaySettings()), seen(runs / "voxel", PlaySettings()))
+    assert not torch.equal(seen(model, PlaySettings(autoguidance=3)), seen(model, PlaySettings()))
+    with pytest.raises(PersistError, match="this checkpoint has no guide"):
+        seen(runs / "voxel", PlaySettings(autoguidance=3))
+    with pytest.raises(PersistError, match="autoguidance of 0\\.5; it must be a number of at least 1"):
+        PlaySettings(autoguidance=0.5)
+
+
+def test_who_plans_samples_away_from_the_guide_where_it_is_asked_for(persist, model, runs, walks, tmp_path):
+    frames = ("--start", f"{walks}#0:2", "--goal", f"{walks}#0:4")
+    small = ("--cost", "distance", "--candidates", 2, "--rounds", 1, "--horizon", 2)
+
+    def planned(name, *options):
+        assert persist("plan", model, *frames, *small, *options, "--out", tmp_path / name).code == 0
+        assert json.loads((tmp_path / name / "plan.json").read_text())["sampling"]["autoguidance"] == float(name)
+        return (tmp_path / name / "sheet.png").read_bytes()
+
+    assert planned("1") != planned("3", "--autoguidance", 3)
+    ended = persist("plan", runs / "voxel", *frames, *small, "--autoguidance", 3, "--out", tmp_path / "none")
+    assert (ended.code, "this checkpoint has no guide" in ended.err) == (1, True), ended.err
+
+
 def test_scenes_that_a_guide_was_trained_on_are_those_of_the_export(persist, runs, tmp_path):
     (tmp_path / "weaker").mkdir()
     scenes = TrainingScenes(frozenset({"seen-by-the-guide"}))
@@ -110,6 +141,9 @@ def refused(persist, runs, *arguments):
 def test_what_cannot_guide_is_one_line(persist, runs):
     assert "its video model is the base itself" in refused(persist, runs, "--guide", runs / "stage1")
     assert "its video model is the base itself" in refused(persist, runs, "--guide", runs / "voxel")
+    guided = ("--guide", runs / "weaker", "--dtype", "float32", "--out", runs / "guided")
+    assert persist("export", runs / "stage1", *guided).code == 0
+    assert "its video model is the base itself" in refused(persist, runs, "--guide", runs / "guided")
     assert "has another codec" in refused(persist, runs, "--guide", runs / "other-base")
     assert "this checkpoint has no guide; persist export --guide" in refused(persist, runs, "--autoguidance", 2)
     assert "no checkpoint there" in refused(persist, runs, "--guide", runs / "nowhere")

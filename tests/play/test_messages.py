@@ -26,6 +26,7 @@ def test_a_message_of_the_page_is_read():
         ('{"type":"jump","x":true,"y":0}', "jump.x"),
         ('{"type":"settings","steps":0}', "settings.steps"),
         ('{"type":"settings","guidance":1e9}', "settings.guidance"),
+        ('{"type":"settings","autoguidance":0.5}', "settings.autoguidance"),
         ('{"type":"record","on":"yes"}', "record.on"),
         ('{"type":"record","on":true,"folder":"/etc"}', "record.folder"),
         ('{"type":"ack","number":-1}', "ack.number"),
@@ -36,6 +37,11 @@ def test_a_wrong_message_is_refused_in_one_line_that_names_the_place(text, place
         read_message(text)
     assert place in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_a_page_is_told_the_limits_of_autoguidance_where_the_model_has_a_guide():
+    assert messages.limits(guided=True).pop("autoguidance") == (1, 10)
+    assert list(messages.limits(guided=False)) == ["steps", "guidance", "seed"]
 
 
 def test_a_message_that_is_too_long_is_not_even_parsed():

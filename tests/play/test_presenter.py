@@ -119,9 +119,14 @@ def test_a_jump_leads_to_the_place_on_the_map(page):
 
 def test_settings_are_told_as_they_are_now_and_wrong_ones_change_nothing(page):
     page.say("settings", steps=3, guidance=1.5, ahead=True)
-    assert page.until("state")[0]["settings"] == {"steps": 3, "guidance": 1.5, "seed": 0, "ahead": True}
+    now = {"steps": 3, "guidance": 1.5, "autoguidance": 1.0, "seed": 0, "ahead": True}
+    assert page.until("state")[0]["settings"] == now
     page.say("settings", guidance=11)
     assert "guidance" in page.until("error")[0]["text"]
+    page.say("settings", autoguidance=2, seed=1)
+    assert "this checkpoint has no guide" in page.until("error")[0]["text"]
+    page.say("settings", steps=3)
+    assert page.until("state")[0]["settings"] == now
 
 
 def test_a_recording_is_fetched_as_a_video_and_a_data_set_while_its_session_lasts(server, page, tmp_path):

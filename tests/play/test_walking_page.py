@@ -45,4 +45,4 @@ def test_each_button_and_field_has_words_for_those_who_do_not_see_it() -> None:
     labelled = [
         name for name in fields if f'for="{name}"' in html or re.search(rf'<label[^>]*><input[^>]* id="{name}"', html)
     ]
-    assert fields == labelled == ["steps", "guidance", "seed", "ahead"]
+    assert fields == labelled == ["steps", "guidance", "autoguidance", "seed", "ahead"]

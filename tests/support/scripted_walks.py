@@ -27,6 +27,7 @@ from persist_cli.play.messages import (
     State,
     ToPage,
     Welcome,
+    limits,
     pack,
 )
 from persist_cli.play.walking_page import walking_page
@@ -58,9 +59,10 @@ class ScriptedWalks:
     def __init__(self, pictures: dict[str, Sequence[np.ndarray[Any, Any]]]) -> None:
         self.pictures = {memory: [png(picture) for picture in row] for memory, row in pictures.items()}
         height, width, _ = next(iter(pictures.values()))[0].shape
-        self.settings = Settings(steps=4, guidance=1.5, seed=0, ahead=True)
+        self.settings = Settings(steps=4, guidance=1.5, autoguidance=1.0, seed=0, ahead=True)
         self.welcome = Welcome(
             model="scripted", memories=list(pictures), actions=ACTIONS, image=(width, height), settings=self.settings,
+            limits=limits(guided=False),
         )  # fmt: skip
         self.said: list[dict[str, Any]] = []  # by the page
         self.heard = threading.Condition()

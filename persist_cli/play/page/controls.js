@@ -9,6 +9,7 @@ const COMMANDS = [ // name, words, key, what it does
   ["stop", "Stop", "Escape", "the planner stops"],
   ["reset", "Reset", "", "begin again; what was imagined is forgotten"],
 ];
+const FIELDS = ["steps", "guidance", "autoguidance", "seed"];
 const NOTICE = 6000; // milliseconds
 const MOST_LINES = 3;
 
@@ -17,7 +18,7 @@ class Controls {
     this.send = send;
     this.state = {};
     addEventListener("keydown", event => this.pressed(event));
-    for (const name of ["steps", "guidance", "seed"]) this.field(name);
+    for (const name of FIELDS) this.field(name);
     byId("ahead").onchange = event => send("settings", { ahead: event.target.checked });
     byId("another-seed").onclick = () => send("settings", { seed: Math.floor(Math.random() * 1e6) });
   }
@@ -36,6 +37,7 @@ class Controls {
     this.keys = Object.fromEntries(COMMANDS.filter(([, , key]) => key && !taken.has(key)).map(([name, , key]) => [key, name]));
     byId("commands").replaceChildren(...COMMANDS.map(command => this.button(...command)));
     for (const [name, [least, most]] of Object.entries(limits)) Object.assign(byId(name), { min: least, max: most });
+    for (const part of document.querySelectorAll("#settings .guided")) part.hidden = !("autoguidance" in limits);
     this.show({ settings, recording: false, goal: false, planning: false });
   }
 
@@ -73,7 +75,7 @@ class Controls {
 
   fill() {
     const { settings } = this.state;
-    for (const name of ["steps", "guidance", "seed"]) {
+    for (const name of FIELDS) {
       if (document.activeElement !== byId(name)) byId(name).value = settings[name];
       if (byId(`${name}-now`)) byId(`${name}-now`).textContent = settings[name];
     }
