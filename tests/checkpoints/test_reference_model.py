@@ -6,8 +6,9 @@ import json
 
 import pytest
 
-from persist_cli.api.checkpoint import reference_checkpoint
-from tests.support.packaged_models import check_files
+from persist_cli.api.checkpoint import find_checkpoint, reference_checkpoint
+from persist_cli.checkpoints.lineage import training_scenes
+from tests.support.packaged_models import check_files, check_sample_is_unseen
 
 MOST_BYTES = 40e6
 
@@ -23,6 +24,10 @@ def packaged(monkeypatch):
 
 def test_every_file_has_its_hash_and_all_are_small_enough(packaged):
     check_files(packaged, MOST_BYTES)
+
+
+def test_the_sample_shows_houses_that_it_was_not_trained_on(packaged):
+    check_sample_is_unseen(training_scenes(find_checkpoint(packaged)))
 
 
 def test_with_memory_the_way_back_is_closer_to_the_truth_than_without(packaged, persist, tmp_path):
