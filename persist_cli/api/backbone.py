@@ -206,6 +206,10 @@ class Backbone(nn.Module, ABC):
         """Return a hash of everything but the clips that ``encode`` depends on; ``NotImplementedError`` without it."""
         raise NotImplementedError(f"backbone {self.name!r} keeps nothing of a clip")
 
+    def check_guide(self, folder: Path) -> None:
+        """Raise ``CheckpointError`` when the ``video_model`` in a folder cannot guide this one."""
+        raise NotImplementedError(f"backbone {self.name!r} has no autoguidance")
+
     def encode(self, clips: Clips) -> ClipLatents:
         """Return the clips' latents, which ``forward`` takes as ``Clips.latents``; needed where ``encodes`` is true."""
         raise NotImplementedError(f"backbone {self.name!r} keeps nothing of a clip")

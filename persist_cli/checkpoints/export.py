@@ -142,7 +142,7 @@ def run_export(plan: ExportPlan, out: Path, json: bool) -> None:
         scenes |= training_scenes(checkpoint)
     with folder_aside(out) as folder:
         with _merged_base(base, folder) as home:
-            files = guide_files(guide, base) if guide else {}
+            files = guide_files(guide, home) if guide else {}
             _write_checkpoint(folder, home, adapters, files, PRECISIONS[plan.dtype])
         save_stage_recipes(folder, _recipes(base, adapters))
         written = _write_card(folder, base, defaults, scenes)

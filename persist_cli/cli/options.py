@@ -96,7 +96,7 @@ ContextNoiseOption = Annotated[
 AutoguidanceOption = Annotated[
     float | None,
     typer.Option(
-        "--autoguidance", min=1, help="Away from the checkpoint's guide, if it has one; the checkpoint's, else 1: none."
+        "--autoguidance", min=1, help="Away from the guide, which the checkpoint must have; its own, else 1: none."
     ),
 ]
 

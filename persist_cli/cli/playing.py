@@ -48,7 +48,8 @@ PlayStepsOption = Annotated[
     typer.Option(min=1, max=50, help="Denoising steps; few answer a key soon. A distilled model's own, else 1."),
 ]
 PlayAutoguidanceOption = Annotated[
-    float, typer.Option("--autoguidance", min=1, max=10, help="Away from the model's guide, if it has one; 1: none.")
+    float,
+    typer.Option("--autoguidance", min=1, max=10, help="Away from the guide, which the model must have; 1: none."),
 ]
 OpenOption = Annotated[
     bool | None, typer.Option("--open/--no-open", help="Open the browser, if there is one; not with --json.")

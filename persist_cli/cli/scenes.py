@@ -10,6 +10,7 @@ from typer.core import TyperCommand
 
 from persist_cli.api.inference import SamplingOverrides
 from persist_cli.cli.options import (
+    AutoguidanceOption,
     GuidanceOption,
     JsonOption,
     SamplerOption,
@@ -46,6 +47,8 @@ def edit_option(metavar: str, help: str) -> Any:
     return typer.Option(metavar=metavar, help=help)
 
 
+IMAGINING = "adapter steps sampler guidance autoguidance"  # options of the model that imagines a view
+
 Given = list[str] | None  # the edits themselves are taken from ``EditCommand``
 
 
@@ -64,14 +67,13 @@ def edit(
     list_things: Annotated[bool, typer.Option("--list", help="List the things of the scene and their boxes.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="What is put somewhere may replace things.")] = False,
     seed: Annotated[int, typer.Option(min=0, help="Of what is imagined behind a removed thing, and of views.")] = 0,
-    camera: Annotated[
-        str | None, typer.Option(help="View of DATA#trajectory:frame; else of the memory's path.")
-    ] = None,
+    camera: Annotated[str | None, typer.Option(help="View: DATA#trajectory:frame; else of the memory's path.")] = None,
     checkpoint: Annotated[Path | None, typer.Option(help="World model that imagines that view of DATA, too.")] = None,
     adapter: Annotated[str | None, typer.Option(help="Its memory adapter; else the only one or the default.")] = None,
     steps: StepsOption = None,
     sampler: SamplerOption = None,
     guidance: GuidanceOption = None,
+    autoguidance: AutoguidanceOption = None,
     verify: VerifyOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -88,14 +90,14 @@ def edit(
     from persist_cli.editing.views import Imagination
 
     if list_things:
-        unused = f"{' '.join(EDITS)} out save_edits overwrite seed camera checkpoint adapter steps sampler guidance"
+        unused = f"{' '.join(EDITS)} out save_edits overwrite seed camera checkpoint {IMAGINING}"
         refuse_options(context, unused, "not with --list, which only lists the things of a scene")
         return run_list(memory, json)
     if out is None:
         raise PersistError("give --out FILE for the edited memory, or --list to see what can be edited")
     if checkpoint is None:
-        refuse_options(context, "adapter steps sampler guidance", "only with --checkpoint, whose model imagines a view")
-    sampling = SamplingOverrides(steps, sampler, guidance)
+        refuse_options(context, IMAGINING, "only with --checkpoint, whose model imagines a view")
+    sampling = SamplingOverrides(steps, sampler, guidance, autoguidance=autoguidance)
     model = None if checkpoint is None else Imagination(checkpoint, adapter, sampling, seed)
     written = tuple(WrittenEdit(*edit) for edit in context.obj)
     plan = EditPlan(memory=memory, written=written, overwrite=overwrite, seed=seed, camera=camera, imagination=model)

@@ -6,8 +6,9 @@ from typing import Any, Final
 
 from persist_cli.errors import PersistError
 
-# keys that earlier versions did not write, with the value that they stood for; None: they looked at no such thing
-ADDED: Final = {"adapter_settings": None, "autoguidance": 1.0}
+# keys that earlier versions did not write, with the values that they stood for; None: they looked at no such thing
+ADDED: Final = {"adapter_settings": None, "autoguidance": (None, 1.0)}
+MISSING: Final = object()  # equals no value, as None would
 
 
 def check_same(earlier: Any, now: Any, refusal: str) -> None:
@@ -41,17 +42,23 @@ def _wherever_it_lies(values: Any) -> Any:
 def _as_earlier(earlier: Any, now: Any) -> Any:
     """Return the values of now without what an earlier version of persist did not write yet."""
     if isinstance(earlier, dict) and isinstance(now, dict):
-        added = {key for key in {*now} - {*earlier} if key in ADDED and ADDED[key] in (None, now[key])}
+        added = {key for key in ADDED.keys() & {*now} - {*earlier} if _stands_for_none(key, now[key])}
         return {key: _as_earlier(earlier.get(key), value) for key, value in now.items() if key not in added}
     if isinstance(earlier, list) and isinstance(now, list) and len(earlier) == len(now):
         return [_as_earlier(*pair) for pair in zip(earlier, now, strict=True)]
     return now
 
 
+def _stands_for_none(key: str, value: Any) -> bool:
+    """Whether a key that was added says nothing that an earlier version had not done without it."""
+    unsaid = ADDED[key]
+    return unsaid is None or value in unsaid
+
+
 def first_difference(earlier: Any, new: Any, where: str = "") -> str:
     """The first key that two plans differ in, with both values."""
     if isinstance(earlier, dict) and isinstance(new, dict):
-        key = next(key for key in sorted({*earlier, *new}) if earlier.get(key) != new.get(key))
+        key = next(key for key in sorted({*earlier, *new}) if earlier.get(key, MISSING) != new.get(key, MISSING))
         return first_difference(earlier.get(key), new.get(key), f"{where} {key}".strip())
     pairs = list(zip(earlier, new, strict=False)) if isinstance(earlier, list) and isinstance(new, list) else []
     if pairs and isinstance(pairs[0][0], dict) and len(earlier) == len(new):

@@ -96,8 +96,8 @@ class Play:
         return (f"this model imagines no depth: what it imagines stops nobody{stays}",)
 
     @property
-    def guided(self) -> bool:
-        """Whether the model has a guide, so that it can sample with autoguidance."""
+    def takes_autoguidance(self) -> bool:
+        """Whether the model has a guide, away from which it can sample (``autoguidance``)."""
         return all(world.backbone.guide_folder is not None for world in self._walkers.worlds.values())
 
     def set(self, settings: PlaySettings) -> None:

@@ -232,7 +232,7 @@ class Presenter:
         ]
         return messages.Welcome(
             model=self.play.model, memories=list(self.play.memories), actions=actions, image=(width, height),
-            settings=self._settings(), limits=messages.limits(self.play.guided),
+            settings=self._settings(), limits=messages.limits(self.play.takes_autoguidance),
         )  # fmt: skip
 
     def _settings(self) -> messages.Settings:

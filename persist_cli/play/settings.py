@@ -23,7 +23,7 @@ GROWTH: Final = (2, 3, 5)  # frames of the first clips under newly held keys, th
 class PlaySettings:
     """How frames are imagined while somebody walks.
 
-    Fewer steps answer a key sooner; each guidance doubles the time of a step.
+    Fewer steps answer a key sooner; each guidance takes another prediction a step.
 
     Args:
         steps: denoising steps of a clip, at least 1.

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from persist_backbones.cogvideox.cogvideox import CogVideoX
 from persist_backbones.cogvideox.model import WorldTransformer
+from persist_backbones.cogvideox.parts import save_world
 from persist_cli.api.backbone import Sampling
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError, PersistError
@@ -82,6 +83,7 @@ def test_a_guide_that_is_the_model_itself_changes_nothing(tmp_path: Path) -> Non
     model.guide_folder = tmp_path
     with_guide, without = (model.sample(random_clips(), Sampling(4, autoguidance=weight)) for weight in (2.0, 1.0))
     torch.testing.assert_close(with_guide, without)
+    assert list(model.guides) == [tmp_path]
 
 
 def test_the_guide_is_told_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -93,6 +95,23 @@ def test_the_guide_is_told_the_memory(tmp_path: Path, monkeypatch: pytest.Monkey
         guides += [made for name, _, made in seen if name == "guide"]
     assert len(guides) == 2
     assert not torch.equal(*guides)
+
+
+def test_the_guide_gets_the_prompt_that_it_was_trained_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = model_and_guide(tmp_path)
+    own = torch.full_like(model.prompt, 2.0)
+    save_world(model.transformer, own, tmp_path)
+    texts: dict[bool, Tensor] = {}
+    run = WorldTransformer.predict
+
+    def predict(transformer: WorldTransformer, *inputs: Any) -> Tensor:
+        texts[transformer is model.transformer] = inputs[2].text
+        return run(transformer, *inputs)
+
+    monkeypatch.setattr(WorldTransformer, "predict", predict)
+    model.generate(random_clips(2), Sampling(1, autoguidance=3.0))
+    assert torch.equal(texts[False], own.expand(2, -1, -1))
+    assert torch.equal(texts[True], model.prompt.expand(2, -1, -1))
 
 
 def test_the_guide_is_no_part_of_the_model_and_its_loading_draws_nothing(tmp_path: Path) -> None:

@@ -80,7 +80,7 @@ def test_a_guide_leaves_the_gpu_with_the_weights_that_are_offloaded(tmp_path):
     backbone.guide_folder = tmp_path
     backbone.prepare_inference(InferenceOptions(offload="model"))
     backbone.generate(CLIPS, Sampling(2, autoguidance=2.0))
-    assert backbone.guides[tmp_path].base.device.type == "cpu"
+    assert backbone.guides[tmp_path].transformer.base.device.type == "cpu"
 
 
 @pytest.mark.parametrize("scale", [1, 4, 8])

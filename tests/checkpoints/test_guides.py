@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import pytest
 import torch
@@ -80,7 +81,7 @@ def test_a_stage_1_that_is_trained_on_has_neither_guide_nor_autoguidance(persist
 def test_who_walks_samples_away_from_the_guide_where_it_is_asked_for(model, runs, walks):
     def seen(checkpoint, settings):
         play = open_play(PlayOptions(checkpoint=checkpoint, begin=StartOptions(f"{walks}#0:2"), settings=settings))
-        assert play.guided == (checkpoint == model)
+        assert play.takes_autoguidance == (checkpoint == model)
         return play.advance({"forward"}).images["voxel"]
 
     assert torch.equal(seen(model, PlaySettings()), seen(runs / "voxel", PlaySettings()))
@@ -144,6 +145,11 @@ def test_what_cannot_guide_is_one_line(persist, runs):
     guided = ("--guide", runs / "weaker", "--dtype", "float32", "--out", runs / "guided")
     assert persist("export", runs / "stage1", *guided).code == 0
     assert "its video model is the base itself" in refused(persist, runs, "--guide", runs / "guided")
+    assert persist("export", runs / "guided", "--out", runs / "halved").code == 0
+    assert "or the same in another precision" in refused(persist, runs, "--guide", runs / "halved")
+    assert persist("export", runs / "halved", "--dtype", "float32", "--out", runs / "widened").code == 0
+    ended = persist("export", runs / "halved", "--guide", runs / "widened", "--out", runs / "refused")
+    assert (ended.code, "its video model is the base itself" in ended.err) == (1, True), ended.err
     assert "has another codec" in refused(persist, runs, "--guide", runs / "other-base")
     assert "this checkpoint has no guide; persist export --guide" in refused(persist, runs, "--autoguidance", 2)
     assert "no checkpoint there" in refused(persist, runs, "--guide", runs / "nowhere")
@@ -164,6 +170,18 @@ def test_what_cannot_guide_is_one_line(persist, runs):
 def test_a_guide_has_the_settings_of_its_base(persist, runs, name, settings, tmp_path):
     write_base(tmp_path / "other", **settings)
     assert f"another {name} than" in refused(persist, runs, "--guide", tmp_path / "other")
+
+
+def test_settings_that_an_older_card_does_not_name_are_those_of_the_backbone(persist, runs, tmp_path):
+    write_base(tmp_path / "other", image_noise=0.5)
+    shutil.copytree(runs / "weaker", tmp_path / "older")
+    card = without_sums(tmp_path / "older") / "persist.json"
+    values = json.loads(card.read_text())
+    assert values["settings"].pop("image_noise") == 0
+    card.write_text(json.dumps(values))
+    refusal = persist("export", tmp_path / "other", "--guide", tmp_path / "older", "--out", tmp_path / "m")
+    assert (refusal.code, "another image_noise than" in refusal.err) == (1, True), refusal.err
+    assert persist("export", runs / "stage1", "--guide", tmp_path / "older", "--out", tmp_path / "m").code == 0
 
 
 def test_a_guide_may_have_another_loss(persist, runs, tmp_path):

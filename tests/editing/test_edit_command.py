@@ -165,6 +165,8 @@ def test_a_voxel_map_is_edited_by_boxes_and_a_world_model_imagines_it_before_and
     assert result.code == 0, result.err
     assert bool((load_memory(out).points().colors == torch.tensor([255, 0, 0], dtype=torch.uint8)).all())
     assert Image.open(tmp_path / "edited-views.png").height > 200
+    other = persist("edit", memory, *options, "--autoguidance", 3, "--out", tmp_path / "other.safetensors")
+    assert (other.code, "this checkpoint has no guide" in other.err) == (1, True), other.err
     assert persist("edit", memory, *options[:3], "--out", tmp_path / "unseen.safetensors").code == 0
     assert (tmp_path / "unseen.safetensors").read_bytes() == out.read_bytes()
     assert "knows no classes" in persist("edit", memory, "--list").err

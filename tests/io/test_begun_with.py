@@ -26,10 +26,16 @@ def test_what_an_earlier_version_did_not_write_is_not_compared():
     earlier, settings = plan("/data/voxel", "1f"), {"adapter_settings": {"voxel": "3a"}}
     now = earlier | {"models": [{"path": "/data/voxel", "fingerprint": "1f"} | settings], "autoguidance": 1.0}
     check_same(earlier, now, "runs/eval: holds another evaluation")
+    check_same({"steps": 4}, {"steps": 4, "autoguidance": None}, "runs/eval: holds another evaluation")
     with pytest.raises(PersistError, match=r"another evaluation .*autoguidance: None, now 2"):
         check_same(earlier, now | {"autoguidance": 2.0}, "runs/eval: holds another evaluation")
     with pytest.raises(PersistError, match=r"another evaluation .*voxel: 3a, now 4b"):
         check_same(settings, {"adapter_settings": {"voxel": "4b"}}, "runs/eval: holds another evaluation")
+
+
+def test_a_key_that_is_there_without_a_value_is_named():
+    with pytest.raises(PersistError, match=r"another evaluation .*seed: None, now None"):
+        check_same({"steps": 4}, {"steps": 4, "seed": None}, "runs/eval: holds another evaluation")
 
 
 def test_a_path_without_a_fingerprint_counts():

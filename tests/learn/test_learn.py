@@ -312,6 +312,7 @@ def test_walks_are_imagined_in_the_precision_that_is_asked_for(walks, voxel, pol
         ("--policy", "nowhere/policy", "no trained policy there"),
         ("--adapter", "voxle", "no memory adapter 'voxle' in it; it has voxel"),
         ("--sampler", "dim", "unknown sampler 'dim'"),
+        ("--autoguidance", "3", "autoguidance of 3: this checkpoint has no guide"),
         ("--set", "training.bach=3", "--set: unknown key 'training.bach', did you mean 'training.batch'?"),
         (
             "--actions",

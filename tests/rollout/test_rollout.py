@@ -126,6 +126,7 @@ def test_rollouts_that_cannot_work_are_refused_in_one_line(persist, voxel, stage
         (stage1, (*left, "--memory", foreign), "without a memory adapter, which cannot read"),
         (voxel, (*left, "--adapter", "map2d"), "no memory adapter 'map2d' in it; it has voxel"),
         (voxel, (*left, "--sampler", "euler"), "unknown sampler 'euler'"),
+        (voxel, (*left, "--autoguidance", 3), "autoguidance of 3: this checkpoint has no guide"),
         (voxel, (*left, "--steps", 1001), "1001 denoising steps; it must be 1 to 1000"),
         (tmp_path / "gone", left, "no checkpoint there"),
     ):

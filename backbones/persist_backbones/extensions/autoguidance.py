@@ -8,10 +8,11 @@ acts at the noisier half of the noise levels, which decide what is there; at the
 
 from __future__ import annotations
 
+import dataclasses
 from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from persist_backbones.cogvideox.inputs import fit_positions
 from persist_backbones.cogvideox.model import Conditions, WorldTransformer, widen
@@ -26,16 +27,32 @@ if TYPE_CHECKING:
 NOISIER = 0.5  # of the noise levels, counted from that without noise: guidance acts from here on
 
 
+class Guide(nn.Module):
+    """A weaker version of a video model.
+
+    Args:
+        transformer: the version.
+        prompt: embedding of the prompt with which it was trained.
+    """
+
+    prompt: Tensor
+
+    def __init__(self, transformer: WorldTransformer, prompt: Tensor) -> None:
+        super().__init__()
+        self.transformer = transformer
+        self.register_buffer("prompt", prompt)
+
+
 class Autoguidance:
     """What a clip is sampled away from, and how strongly.
 
     Args:
         model: the model that is sampled.
-        guide: a weaker version of its video model.
+        guide: a weaker version of its video model, which comes to the model's device.
         weight: how far to go beyond the guide; at 1 it changes nothing.
     """
 
-    def __init__(self, model: CogVideoX, guide: WorldTransformer, weight: float) -> None:
+    def __init__(self, model: CogVideoX, guide: Guide, weight: float) -> None:
         self.model, self.weight = model, weight
         self.guide = guide.to(model.device, model.prompt.dtype)
 
@@ -46,22 +63,18 @@ class Autoguidance:
             predicted: the model's prediction, with its guidance over memory.
             noisy: the noisy latents.
             image: latents of the image condition.
-            conditions: all other inputs, which the guide gets too, memory included.
+            conditions: all other inputs, which the guide gets too, memory included, but for the prompt.
         """
-        if not self.acts(self.model.current_timestep):
+        model, guide, precision = self.model, self.guide, self.model.prompt.dtype
+        if float(conditions.timestep[0]) < NOISIER * int(model.scheduler.config.num_train_timesteps):
             return predicted
-        model, precision = self.model, self.model.prompt.dtype
+        conditions = dataclasses.replace(conditions, text=guide.prompt.expand(len(noisy), -1, -1))
         inputs = noisy.to(precision), image.to(precision), conditions
-        weaker = self.guide.predict(*inputs, model.shape, model.settings.depth).to(predicted.dtype)
+        weaker = guide.transformer.predict(*inputs, model.shape, model.settings.depth).to(predicted.dtype)
         return weaker + self.weight * (predicted - weaker)
 
-    def acts(self, timestep: Tensor | None) -> bool:
-        """Whether a timestep is of a noise level at which guidance acts."""
-        levels = int(self.model.scheduler.config.num_train_timesteps)
-        return timestep is not None and float(timestep) >= NOISIER * levels
 
-
-def load_guide(model: CogVideoX, folder: Path) -> WorldTransformer:
+def load_guide(model: CogVideoX, folder: Path) -> Guide:
     """Load the guide of a model, whose codec and shape of clips it shares.
 
     Raises:
@@ -75,5 +88,4 @@ def load_guide(model: CogVideoX, folder: Path) -> WorldTransformer:
     fit_positions(transformer, (model.shape.padded_frames, model.shape.height, model.shape.width))
     with torch.random.fork_rng(devices=[]):
         guide = widen(transformer, model.codec.vae, model.settings, model.shape)
-    load_world(guide, folder)
-    return guide.requires_grad_(False).eval()
+    return Guide(guide, load_world(guide, folder)).requires_grad_(False).eval()

@@ -16,7 +16,7 @@ from persist_backbones.cogvideox.model import Conditions, WorldTransformer
 from persist_backbones.cogvideox.parameter_groups import DISCRIMINATOR
 from persist_backbones.cogvideox.parts import DiffusersParts, save_world
 from persist_backbones.extensions.adversarial import Discriminator, adversarial_loss, make_discriminator
-from persist_backbones.extensions.autoguidance import Autoguidance, load_guide
+from persist_backbones.extensions.autoguidance import Autoguidance, Guide, load_guide
 from persist_backbones.extensions.distillation import (
     Distillation,
     check_levels,
@@ -48,7 +48,7 @@ class ExtendedCogVideoX(CogVideoX):
         self.frozen = FrozenWeights(self, None)
         self.offloaded: OffloadedParts | None = None
         self.caches: ClipCaches | None = None  # while a clip is sampled
-        self.guides: dict[Path, WorldTransformer] = {}  # those that were needed, by folder; no part of the model
+        self.guides: dict[Path, Guide] = {}  # those that were needed, by folder; no part of the model
         self.autoguidance: Autoguidance | None = None  # while a clip is sampled
         self.distillation: Distillation | None = None
         self.adversarial: Adversarial | None = None
@@ -96,6 +96,7 @@ class ExtendedCogVideoX(CogVideoX):
             from persist_backbones.extensions.caches import ClipCaches  # diffusers' hooks take a second to import
 
             self.caches = ClipCaches(self.transformer)
+        self.check_sampling(sampling)
         try:
             self.autoguidance = self.guidance_of(sampling)
             return super().sample(first, sampling, on_step, generators, noise)
@@ -109,13 +110,15 @@ class ExtendedCogVideoX(CogVideoX):
 
     def guidance_of(self, sampling: Sampling) -> Autoguidance | None:
         """Return the guidance away from the guide that a sampling asks for; the guide is loaded the first time."""
-        if sampling.autoguidance == 1:
+        if sampling.autoguidance == 1 or self.guide_folder is None:
             return None
-        self.check_sampling(sampling)
-        assert self.guide_folder is not None  # as was checked
         if self.guide_folder not in self.guides:
             self.guides[self.guide_folder] = load_guide(self, self.guide_folder)
         return Autoguidance(self, self.guides[self.guide_folder], sampling.autoguidance)
+
+    def check_guide(self, folder: Path) -> None:
+        """Raise ``CheckpointError`` when the video model in a folder has other sizes than this one."""
+        load_guide(self, folder)
 
     def predict_guided(self, noisy: Tensor, image: Tensor, conditions: Conditions, guidance: float) -> Tensor:
         """Predict with guidance over memory, and away from the guide."""

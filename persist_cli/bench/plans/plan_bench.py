@@ -204,7 +204,7 @@ def prepare(plan: BenchPlan, out: Path, processes: Processes) -> PlanningBench:
     found = find_checkpoint(plan.checkpoint) if uses_model or named else None
     checkpoint = found if uses_model else None
     if checkpoint is not None:
-        check_adapters(checkpoint, rows)
+        check_model(checkpoint, rows, plan.sampling)
     journal = PlanningJournal(out)
     if processes.main:
         values = identity(plan, rows, cost, checkpoint, policies[plan.policy])
@@ -286,8 +286,9 @@ def check_policies(rows: Sequence[PlanningRow], policies: Mapping[str | None, Po
             )
 
 
-def check_adapters(checkpoint: Checkpoint, rows: Sequence[PlanningRow]) -> None:
-    """Raise ``PersistError`` when the model lacks the adapter of a row."""
+def check_model(checkpoint: Checkpoint, rows: Sequence[PlanningRow], sampling: SamplingOverrides) -> None:
+    """Raise ``PersistError`` when the model lacks the adapter of a row, or cannot sample so."""
+    empty_backbone(checkpoint).check_sampling(checkpoint.sampling_with(sampling))
     for row in rows:
         if row.uses_world_model and (adapter := adapter_of(checkpoint, row)) is not None:
             adapter_memory(checkpoint, adapter)

@@ -373,6 +373,15 @@ def test_a_memory_that_the_model_lacks_is_refused_before_episodes_are_looked_for
     assert len(ended.err.strip().splitlines()) == 1
 
 
+def test_a_sampling_that_the_model_cannot_do_is_refused_before_any_row_is_run(
+    bench: Bench, voxel: Path, tmp_path: Path
+) -> None:
+    rows = ("--cost", "distance", "--rows", "random,rank-2", "--memories", "none", "--loops", "closed")
+    ended = bench(voxel, *rows, "--autoguidance", 3)
+    assert (ended.code, "autoguidance of 3: this checkpoint has no guide" in ended.err) == (1, True), ended.err
+    assert not (tmp_path / "bench").exists()
+
+
 def test_episodes_of_another_image_size_are_refused(
     persist: Persist, voxel: Path, episodes: EpisodeSet, tmp_path: Path
 ) -> None:

@@ -55,6 +55,15 @@ def measured(
     return out
 
 
+def test_a_sampling_that_the_model_cannot_do_is_refused_before_anything_is_measured(
+    persist: Persist, cell_houses: Path, scene_renderer: Path, tmp_path: Path
+) -> None:
+    options = ("--data", cell_houses, "--parts", "completion,edits", "--checkpoint", scene_renderer)
+    ended = persist("bench", "scene", *options, "--autoguidance", 3, "--out", tmp_path / "out")
+    assert (ended.code, "autoguidance of 3: this checkpoint has no guide" in ended.err) == (1, True), ended.err
+    assert not (tmp_path / "out").exists()
+
+
 def test_the_way_back_has_the_poses_of_the_way_out(measured: Path) -> None:
     walk = read_tensors(next((measured / "parts").glob("return-scene-true-grid*/*")))[0]
     out, frames = int(walk["out"]), len(walk["poses"])
