@@ -63,6 +63,8 @@ class Distill:
             the model was trained with.
         guidance: weight of guidance over memory with which the teacher predicts, in stage 2. The student learns its
             result, and needs one prediction a step where the teacher needs two.
+        autoguidance: weight of guidance away from the teacher's guide, at least 1; 1 means none. The student learns its
+            result and needs no guide.
         loss: how far two clips are from each other: ``huber``, near the absolute error, or ``squared``.
         steps: number of denoising steps that the checkpoint asks for when it is sampled, a divisor of ``levels``.
     """
@@ -70,6 +72,7 @@ class Distill:
     teacher: str | None = None
     levels: Annotated[int, Field(ge=2)] = 48
     guidance: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1.0
+    autoguidance: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 1.0
     loss: Literal["huber", "squared"] = "huber"
     steps: Annotated[int, Field(ge=1)] = 1
 

@@ -105,6 +105,26 @@ def test_the_target_is_another_where_the_teacher_has_guidance_over_memory():
     assert not torch.allclose(*targets)
 
 
+def test_the_target_is_another_at_the_noisier_levels_where_the_teacher_is_sampled_away_from_its_guide(tmp_path):
+    backbone = shaken_micro()
+    guide = micro(prediction="sample", **FRAMEWISE)
+    shaken(guide, 0.02)
+    guide.save_base(tmp_path)
+    backbone.guide_folder = tmp_path
+    clips = random_clips(2)
+    states = [generator.get_state() for generator in sample_generators(clips.seeds)]
+    noised = backbone.add_noise(clips, sample_generators(clips.seeds), lambda _: torch.tensor([999, 499]))
+    plain, guided = (distilled(backbone, autoguidance=weight) for weight in (1.0, 3.0))
+    with torch.no_grad():
+        targets = [consistency_target(clips, noised, states, one) for one in (plain, guided)]
+        own, weaker = (predict_clean(model, clips, noised, states) for model in (backbone, guide))
+        taught = predict_clean(guided.teacher, clips, noised, states, 1.0, guided.autoguidance)
+    torch.testing.assert_close(taught[0], weaker[0] + 3 * (own[0] - weaker[0]))
+    assert torch.equal(taught[1], own[1])
+    assert not torch.allclose(targets[0][0], targets[1][0])
+    assert torch.equal(targets[0][1], targets[1][1])
+
+
 def with_dropout():
     """A model whose adapter hides and disturbs memory in training, and clips of which some lose theirs."""
     backbone = with_adapter(

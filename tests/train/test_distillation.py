@@ -9,6 +9,7 @@ import pytest
 import torch
 from accelerate import Accelerator
 
+from persist_cli.api.backbone import Sampling
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.inference import SamplingOverrides
 from persist_cli.checkpoints.lineage import training_scenes
@@ -17,6 +18,7 @@ from persist_cli.errors import RecipeError
 from persist_cli.recipe import make_recipe, parse_yaml_mapping
 from persist_cli.train.run_folder import source_scenes
 from persist_cli.train.trainer import Trainer
+from tests.support.export_runs import write_weaker
 from tests.support.micro_model import micro, shaken
 from tests.support.micro_runs import equal_runs, losses, stage
 
@@ -121,6 +123,29 @@ def test_an_adapter_is_distilled_on_the_base_that_it_stands_on(persist, walks, v
     checkpoint = find_checkpoint(run)
     assert checkpoint.base_folder == find_checkpoint(stage1).folder
     assert checkpoint.sampling_with(SamplingOverrides(), "revisit").steps == 1
+
+
+def test_a_teacher_may_be_sampled_away_from_its_guide_which_the_student_does_not_need(persist, walks, stage1, tmp_path):
+    model, options = tmp_path / "model", (*DISTILL, "distill.autoguidance=3", "training.steps=2")
+    write_weaker(stage1, tmp_path / "weaker")
+    exported = persist("export", stage1, "--guide", tmp_path / "weaker", "--dtype", "float32", "--out", model)
+    assert exported.code == 0, exported.err
+    whole, halves = (stage("stage1", walks, tmp_path / name, f"base={model}", *options) for name in ("whole", "halves"))
+    assert persist(*whole).code == 0
+    assert persist(*halves, "training.steps=1").code == 0
+    assert persist(*halves, "--resume").code == 0
+    assert equal_runs(tmp_path / "whole", tmp_path / "halves")
+    checkpoint = find_checkpoint(tmp_path / "whole")
+    assert checkpoint.sampling_with(SamplingOverrides()) == Sampling(1, "consistency")
+    assert not (checkpoint.base_folder / "guide").exists()
+    assert (
+        persist(*stage("stage1", walks, tmp_path / "plain", f"base={model}", *options, "distill.autoguidance=1")).code
+        == 0
+    )
+    assert losses(tmp_path / "plain") != losses(tmp_path / "whole")
+    failed = persist(*stage("stage1", walks, tmp_path / "none", f"base={stage1}", *options))
+    assert (failed.code, len(failed.err.strip().splitlines())) == (1, 1)
+    assert "distill.autoguidance=3: the teacher has no guide" in failed.err
 
 
 def test_an_adapter_that_is_not_distilled_on_a_base_that_is_gets_a_warning(persist, walks, stage1, tmp_path):

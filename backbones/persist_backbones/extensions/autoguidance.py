@@ -66,12 +66,13 @@ class Autoguidance:
             conditions: all other inputs, which the guide gets too, memory included, but for the prompt.
         """
         model, guide, precision = self.model, self.guide, self.model.prompt.dtype
-        if float(conditions.timestep[0]) < NOISIER * int(model.scheduler.config.num_train_timesteps):
+        acts = conditions.timestep >= NOISIER * int(model.scheduler.config.num_train_timesteps)
+        if not acts.any():
             return predicted
         conditions = dataclasses.replace(conditions, text=guide.prompt.expand(len(noisy), -1, -1))
         inputs = noisy.to(precision), image.to(precision), conditions
         weaker = guide.transformer.predict(*inputs, model.shape, model.settings.depth).to(predicted.dtype)
-        return weaker + self.weight * (predicted - weaker)
+        return torch.where(acts[:, None, None, None, None], weaker + self.weight * (predicted - weaker), predicted)
 
 
 def load_guide(model: CogVideoX, folder: Path) -> Guide:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import torch
@@ -27,6 +28,7 @@ from persist_backbones.cogvideox.diffusion import (
     sample_generators,
 )
 from persist_backbones.diffusers_models import CogVideoXDDIMScheduler
+from persist_backbones.extensions.autoguidance import Autoguidance, load_guide
 from persist_cli.api.backbone import Clips
 from persist_cli.api.stages import Distill
 from persist_cli.errors import CheckpointError, RecipeError
@@ -104,6 +106,14 @@ class Distillation:
         """The noise levels."""
         return Levels(self.settings.levels, self.teacher.scheduler.config.num_train_timesteps)
 
+    @cached_property
+    def autoguidance(self) -> Autoguidance | None:
+        """The teacher's guidance away from its guide, which is loaded when it is first asked for."""
+        folder, weight = self.teacher.guide_folder, self.settings.autoguidance
+        if weight == 1 or folder is None:
+            return None
+        return Autoguidance(self.teacher, load_guide(self.teacher, folder), weight)
+
 
 def consistency_loss(model: CogVideoX, clips: Clips, distillation: Distillation) -> dict[str, Tensor]:
     """Return the loss of consistency distillation of a batch, and its parts of RGB and depth."""
@@ -121,7 +131,7 @@ def consistency_target(
 ) -> Tensor:
     """Return the clean latents that the target predicts after the teacher's step; arguments as of ``predict_clean``."""
     teacher, guidance = distillation.teacher, distillation.settings.guidance
-    guided = predict_clean(teacher, clips, noised, generator_states, guidance)
+    guided = predict_clean(teacher, clips, noised, generator_states, guidance, distillation.autoguidance)
     following, last = distillation.levels.following(noised.timesteps)
     here, there = (noise_level(teacher.scheduler, timesteps) for timesteps in (noised.timesteps, following))
     nearer = noised._replace(noisy=ddim_step(guided, noised.noisy, here, there), timesteps=following)
@@ -130,7 +140,12 @@ def consistency_target(
 
 
 def predict_clean(
-    model: CogVideoX, clips: Clips, noised: NoisedClips, generator_states: Sequence[Tensor], guidance: float = 1.0
+    model: CogVideoX,
+    clips: Clips,
+    noised: NoisedClips,
+    generator_states: Sequence[Tensor],
+    guidance: float = 1.0,
+    autoguidance: Autoguidance | None = None,
 ) -> Float[Tensor, "batch frame channel height width"]:
     """Return the clean latents as a model predicts them from noisy ones, float32.
 
@@ -140,11 +155,14 @@ def predict_clean(
         noised: their latents with noise.
         generator_states: for each sample the state of the generator that draws whether it sees no memory.
         guidance: weight of guidance over memory.
+        autoguidance: guidance of this model away from a weaker version.
     """
     memory = model.memory_condition(clips, [torch.Generator().set_state(state) for state in generator_states])
     conditions = model.conditions(clips, noised.timesteps, memory, noised.image_noise)
     with model.transformer.kernel_for_training(noised.noisy):
         predicted = model.predict_guided(noised.noisy, noised.image, conditions, guidance)
+        if autoguidance is not None:
+            predicted = autoguidance.lead(predicted, noised.noisy, noised.image, conditions)
     return conditions.level.clean(predicted.float(), noised.noisy.float())
 
 
@@ -167,6 +185,15 @@ def check_teacher(student: CogVideoX, teacher: CogVideoX) -> None:
     differs = [name for name, other in differences.items() if other]
     if differs:
         raise CheckpointError(f"distill.teacher: its {' and '.join(differs)} differ from those of the model to train")
+
+
+def check_guided(settings: Distill, teacher: CogVideoX) -> None:
+    """Raise ``CheckpointError`` when a teacher shall be sampled away from a guide that it has not."""
+    if settings.autoguidance != 1 and teacher.guide_folder is None:
+        raise CheckpointError(
+            f"distill.autoguidance={settings.autoguidance:g}: the teacher has no guide; persist export --guide puts a "
+            "weaker version of the model beside it"
+        )
 
 
 def check_levels(settings: Distill, scheduler: CogVideoXDDIMScheduler) -> None:

@@ -19,6 +19,7 @@ from persist_backbones.extensions.adversarial import Discriminator, adversarial_
 from persist_backbones.extensions.autoguidance import Autoguidance, Guide, load_guide
 from persist_backbones.extensions.distillation import (
     Distillation,
+    check_guided,
     check_levels,
     check_teacher,
     consistency_loss,
@@ -73,6 +74,7 @@ class ExtendedCogVideoX(CogVideoX):
             raise CheckpointError(f"distill.teacher: a model of backbone {teacher.name!r} cannot teach {self.name!r}")
         if teacher is not self:  # as where memory is estimated, and tensors have no values
             check_teacher(self, teacher)
+            check_guided(settings, teacher)
             check_levels(settings, self.scheduler)
         self.distillation = Distillation(settings, teacher, target)
         self.own_sampling = Sampling(settings.steps, CONSISTENCY)
