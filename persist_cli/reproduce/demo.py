@@ -33,6 +33,7 @@ from persist_cli.reproduce.commands import run_main
 HALF: Final = 32  # frames after the first that the memory is made of; what follows is the way back, by another way
 ROLLOUTS: Final = ("with-memory", "without-memory")  # folders of the two rollouts
 WALK: Final = "walk"  # folder of the rollout from a single image
+INVENTING: Final = "--steps 10 --sampler ddim --autoguidance 3"  # four steps blur what nobody has seen
 CLIPS: Final = 4  # clips that the reference model is evaluated on
 TRAINING: Final = "training.checkpoint_minutes=60 training.workers=1"
 
@@ -68,7 +69,8 @@ def reference_commands(out: Path) -> list[str]:
         f"memorize sample#0:0-{HALF + 1} --memory voxel --out {memory}",
         f"rollout {back} --adapter voxel --memory {memory} --out {home}/with-memory",
         f"rollout {back} --adapter none --out {home}/without-memory",
-        f"rollout --start sample#1:0 --follow --frames {2 * HALF} --seed 0 --adapter voxel --out {home}/{WALK}",
+        f"rollout --start sample#1:0 --follow --frames {2 * HALF} --seed 0 --adapter voxel {INVENTING} "
+        f"--out {home}/{WALK}",
         f"eval --data sample --memories none,voxel --controls copy,nearest,warp,codec --metrics {metrics} --seeds 1 "
         f"--clips {CLIPS} --out {home}/eval --report {home}/report",
     ]
