@@ -17,18 +17,18 @@ from persist_cli.api.inference import SamplingOverrides
 from persist_cli.checkpoints.export import ExportPlan, run_export
 from persist_cli.data.reference import parse_reference, sample_data
 from persist_cli.memorize.memory_file import load_memory
-from tests.support.export_runs import write_runs
+from tests.support.export_runs import write_runs, write_weaker
 from tests.support.micro_runs import stage
 
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory, held_out):
-    """A folder with a micro model as the reference model and walks that come back another way as the sample data."""
+    """A folder with a micro model and its guide as the reference model, and walks that come back another way."""
     folder = tmp_path_factory.mktemp("home")
     runs = write_runs(folder / "runs")
     plan = ExportPlan(
         checkpoint=runs / "stage1", runs=[str(runs / "none"), str(runs / "voxel")], dtype="float16", default="voxel",
-        sampling=SamplingOverrides(steps=1),
+        sampling=SamplingOverrides(steps=1), guide=write_weaker(runs / "stage1", runs / "weaker"),
     )  # fmt: skip
     run_export(plan, folder / "reference", False)
     shutil.copytree(held_out, folder / "sample")

@@ -8,6 +8,7 @@ import pytest
 
 from persist_cli.api.checkpoint import find_checkpoint, reference_checkpoint
 from persist_cli.checkpoints.lineage import training_scenes
+from persist_cli.checkpoints.load import empty_backbone
 from tests.support.packaged_models import check_files, check_sample_is_unseen
 
 MOST_BYTES = 40e6
@@ -24,6 +25,14 @@ def packaged(monkeypatch):
 
 def test_every_file_has_its_hash_and_all_are_small_enough(packaged):
     check_files(packaged, MOST_BYTES)
+
+
+def test_what_is_invented_in_evaluations_is_sampled_away_from_its_guide(packaged):
+    checkpoint = find_checkpoint(packaged)
+    weights = {name: sampling.autoguidance for name, sampling in checkpoint.protocol_sampling.items()}
+    assert weights == {"return": 3.0, "long": 3.0}
+    for sampling in checkpoint.protocol_sampling.values():
+        empty_backbone(checkpoint).check_sampling(sampling)
 
 
 def test_the_sample_shows_houses_that_it_was_not_trained_on(packaged):
