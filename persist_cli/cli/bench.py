@@ -250,7 +250,7 @@ def bench_scene(
     chosen, rendering = split_names(parts), None
     refuse_other_parts(context, chosen)
     if checkpoint is None:
-        unused = "memories return_steps denoising_steps sampler guidance autoguidance dtype save_memory"
+        unused = " ".join(("memories", "return_steps", *RENDERING[1:]))
         refuse_options(context, unused, "only with --checkpoint, whose model draws scenes")
     else:
         sampling = SamplingOverrides(denoising_steps, sampler, guidance, autoguidance=autoguidance)

@@ -150,3 +150,11 @@ def test_a_cache_that_cannot_work_is_refused():
     backbone.transformer.base.enable_cache(TaylorSeerCacheConfig())  # whose own names for layers fit none
     with pytest.raises(PersistError, match=r"^TaylorSeerCacheConfig fits no layer; attention is"):
         backbone.generate(CLIPS, SAMPLING)
+
+
+def test_a_sampling_that_is_refused_leaves_no_cache_behind():
+    backbone = trained()
+    enable_cache(backbone.transformer, IDLE["first-block"]())
+    with pytest.raises(PersistError, match="has no guide"):
+        backbone.sample(CLIPS, dataclasses.replace(SAMPLING, autoguidance=2.0))
+    assert backbone.caches is None

@@ -75,6 +75,22 @@ class Autoguidance:
         return torch.where(acts[:, None, None, None, None], weaker + self.weight * (predicted - weaker), predicted)
 
 
+def autoguidance_of(model: CogVideoX, weight: float, guides: dict[Path, Guide]) -> Autoguidance | None:
+    """Return a model's guidance away from its guide; ``None`` where there is none, or the weight asks for none.
+
+    Args:
+        model: the model that is sampled.
+        weight: how far to go beyond the guide.
+        guides: those that were loaded, by folder; a guide that is not among them is loaded, and kept there.
+    """
+    folder = model.guide_folder
+    if weight == 1 or folder is None:
+        return None
+    if folder not in guides:
+        guides[folder] = load_guide(model, folder)
+    return Autoguidance(model, guides[folder], weight)
+
+
 def load_guide(model: CogVideoX, folder: Path) -> Guide:
     """Load the guide of a model, whose codec and shape of clips it shares.
 

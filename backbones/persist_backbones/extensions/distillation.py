@@ -28,7 +28,7 @@ from persist_backbones.cogvideox.diffusion import (
     sample_generators,
 )
 from persist_backbones.diffusers_models import CogVideoXDDIMScheduler
-from persist_backbones.extensions.autoguidance import Autoguidance, load_guide
+from persist_backbones.extensions.autoguidance import Autoguidance, autoguidance_of
 from persist_cli.api.backbone import Clips
 from persist_cli.api.stages import Distill
 from persist_cli.errors import CheckpointError, RecipeError
@@ -109,10 +109,7 @@ class Distillation:
     @cached_property
     def autoguidance(self) -> Autoguidance | None:
         """The teacher's guidance away from its guide, which is loaded when it is first asked for."""
-        folder, weight = self.teacher.guide_folder, self.settings.autoguidance
-        if weight == 1 or folder is None:
-            return None
-        return Autoguidance(self.teacher, load_guide(self.teacher, folder), weight)
+        return autoguidance_of(self.teacher, self.settings.autoguidance, {})
 
 
 def consistency_loss(model: CogVideoX, clips: Clips, distillation: Distillation) -> dict[str, Tensor]:

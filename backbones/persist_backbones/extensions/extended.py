@@ -16,7 +16,7 @@ from persist_backbones.cogvideox.model import Conditions, WorldTransformer
 from persist_backbones.cogvideox.parameter_groups import DISCRIMINATOR
 from persist_backbones.cogvideox.parts import DiffusersParts, save_world
 from persist_backbones.extensions.adversarial import Discriminator, adversarial_loss, make_discriminator
-from persist_backbones.extensions.autoguidance import Autoguidance, Guide, load_guide
+from persist_backbones.extensions.autoguidance import Autoguidance, Guide, autoguidance_of, load_guide
 from persist_backbones.extensions.distillation import (
     Distillation,
     check_guided,
@@ -98,9 +98,8 @@ class ExtendedCogVideoX(CogVideoX):
             from persist_backbones.extensions.caches import ClipCaches  # diffusers' hooks take a second to import
 
             self.caches = ClipCaches(self.transformer)
-        self.check_sampling(sampling)
         try:
-            self.autoguidance = self.guidance_of(sampling)
+            self.autoguidance = autoguidance_of(self, sampling.autoguidance, self.guides)
             return super().sample(first, sampling, on_step, generators, noise)
         finally:
             if self.autoguidance is not None and self.offloaded is not None:
@@ -109,14 +108,6 @@ class ExtendedCogVideoX(CogVideoX):
             if self.caches is not None:
                 self.caches.forget()
                 self.caches = None
-
-    def guidance_of(self, sampling: Sampling) -> Autoguidance | None:
-        """Return the guidance away from the guide that a sampling asks for; the guide is loaded the first time."""
-        if sampling.autoguidance == 1 or self.guide_folder is None:
-            return None
-        if self.guide_folder not in self.guides:
-            self.guides[self.guide_folder] = load_guide(self, self.guide_folder)
-        return Autoguidance(self, self.guides[self.guide_folder], sampling.autoguidance)
 
     def check_guide(self, folder: Path) -> None:
         """Raise ``CheckpointError`` when the video model in a folder has other sizes than this one."""
