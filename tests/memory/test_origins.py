@@ -182,6 +182,15 @@ def test_written_once_an_observation_still_replaces_what_was_imagined():
     assert equal(stored_as(memory, Origin.OBSERVED), observed.tensors())
 
 
+@GRIDS
+def test_a_map_that_never_writes_what_is_imagined_holds_what_was_observed_alone(name):
+    walk = room_walk(4)
+    memory = written_memory(name, imagined(walk[:2]), imagined="never")
+    assert memory.tensors() == {}
+    memory.write(Observations.concatenate([walk[:2], imagined(walk[2:])]))
+    assert same_bits(memory, written_memory(name, walk[:2], imagined="never"))
+
+
 def test_an_imagined_frame_that_adds_too_little_is_not_written():
     ahead, beside = (observe([look((0.0, 1.4, 0.0), yaw)]) for yaw in (0.0, 15.0))
     sizes = {}
@@ -200,3 +209,16 @@ def test_imagined_pixels_on_depth_edges_are_not_written():
     whole, cut = (written_memory("voxel", view, cell=(0.05,) * 3, edges=edges).figures().cells for edges in (0.0, 0.2))
     none = written_memory("voxel", view, cell=(0.05,) * 3, edges=1e-9).figures().cells
     assert none < cut < whole
+
+
+def test_gaps_between_known_cells_are_not_imagined_again():
+    view = observe([look((0.0, 1.4, 0.0), 0.0)])
+    sparse = replace(view, depth=view.depth.clone())
+    sparse.depth[:, ::2, ::2] = 0.0
+    added = {}
+    for share in (1.0, 0.3):
+        memory = written_memory("voxel", sparse, cell=(0.02,) * 3, imagined="once", closing=share)
+        memory.write(imagined(view))
+        added[share] = memory.figures().imagined
+    assert added[1.0] > 100
+    assert added[0.3] == 0

@@ -21,7 +21,14 @@ from persist_cli.errors import CheckpointError
 from persist_memory.batched_reads import distinct_cameras, same_size
 from persist_memory.detail import feature_across
 from persist_memory.grid.editing import MapForm, edit_cells
-from persist_memory.grid.occlusion import CellBlocks, covered_by_blocks, with_enough_new, without_edges, without_known
+from persist_memory.grid.occlusion import (
+    CellBlocks,
+    closed,
+    covered_by_blocks,
+    with_enough_new,
+    without_edges,
+    without_known,
+)
 from persist_memory.grid.pooling import (
     GridSettings,
     Lattice,
@@ -110,6 +117,8 @@ class GridMemory(Memory):
         on_cpu = observations.depth.device.type == "cpu"
         step = max(1, (PIXELS_ON_CPU if on_cpu else PIXELS_ON_GPU) // observations.depth[0].numel())
         for origin, frames in observations.by_origin():
+            if origin == Origin.IMAGINED and self.settings.imagined == "never":
+                continue
             once = origin == Origin.IMAGINED and self.settings.imagined == "once"
             length = 1 if once else step
             for begin in range(0, len(frames), length):
@@ -231,12 +240,14 @@ class GridMemory(Memory):
 
     def _unknown(self, imagined: Observations) -> Observations:
         """Imagined frames without the depth of what is not written: see ``GridSettings``."""
-        new = without_edges(imagined, self.settings.edges) if self.settings.edges else imagined
+        settings = self.settings
+        new = without_edges(imagined, settings.edges) if settings.edges else imagined
         if len(self.grid) and not self.lattice.flat:
             cameras = imagined.cameras.to(self.grid.device)
             known = covered_by_blocks(self.known_blocks(cameras), self.lattice.across, cameras)
+            known = closed(known, settings.closing) if settings.closing < 1 else known
             new = without_known(new, known.to(imagined.depth.device))
-        return with_enough_new(imagined, new, self.settings.least_new) if self.settings.least_new else new
+        return with_enough_new(imagined, new, settings.least_new) if settings.least_new else new
 
     def _pool(self, observations: Observations, origin: Origin, once: bool) -> None:
         """Pool frames into their cells; ``once`` leaves out those that there are."""

@@ -47,6 +47,12 @@ def without_known(observations: Observations, known: Bool[Tensor, "frame height 
     return replace(observations, depth=torch.where(known, 0.0, observations.depth))
 
 
+def closed(known: Bool[Tensor, "frame height width"], share: float) -> Bool[Tensor, "frame height width"]:
+    """Known pixels, and those around which at least a share of 3 × 3 pixels is known; beyond the image none is."""
+    around = torch.nn.functional.avg_pool2d(known[:, None].float(), 3, stride=1, padding=1)[:, 0]
+    return known | (around > share - 1e-6)
+
+
 def covered_by_blocks(blocks: CellBlocks, edge: float, cameras: Cameras) -> Bool[Tensor, "frame height width"]:
     """Whether a cell lies along the ray of each pixel, as ``covered`` says, in a time that hardly grows with the cells.
 

@@ -42,18 +42,21 @@ class GridSettings:
         max_depth: largest depth in metres; pixels that are farther are left out, none with ``None``.
         imagined: what becomes of imagined frames that show a place which was imagined before: ``merge`` pools them
             into its cells; ``once`` writes frame by frame, each only along rays on which no cell lies, so that the
-            first view of a place stays.
+            first view of a place stays. ``never`` writes no imagined frame at all.
         least_new: smallest share of the pixels of an imagined frame that must add something, or none is written.
         edges: an imagined pixel is not written where depth changes by more than this share of it from one pixel to the
             next; 0 writes all.
+        closing: an imagined pixel shows a known place where at least this share of the 3 × 3 pixels around it do,
+            through whose gaps it would be written again; 1 takes each pixel alone.
     """
 
     pooling: Literal["max", "mean"] = "max"
     stride: PositiveInt = 1
     max_depth: Metres | None = None
-    imagined: Literal["merge", "once"] = "merge"
+    imagined: Literal["merge", "once", "never"] = "merge"
     least_new: Annotated[float, Field(ge=0, le=1)] = 0.0
     edges: NonNegativeFloat = 0.0
+    closing: Annotated[float, Field(gt=0, le=1)] = 1.0
 
 
 @dataclass(frozen=True)
