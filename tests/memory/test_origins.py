@@ -183,6 +183,14 @@ def test_written_once_an_observation_still_replaces_what_was_imagined():
 
 
 @GRIDS
+def test_maps_that_write_what_is_imagined_by_other_rules_can_be_merged(name):
+    walk = room_walk(4)
+    memory = written_memory(name, walk[:2], imagined="once", closing=0.3)
+    memory.merge(written_memory(name, walk[2:], edges=0.2, least_new=0.1))
+    assert same_bits(memory, written_memory(name, walk))
+
+
+@GRIDS
 def test_a_map_that_never_writes_what_is_imagined_holds_what_was_observed_alone(name):
     walk = room_walk(4)
     memory = written_memory(name, imagined(walk[:2]), imagined="never")

@@ -64,6 +64,7 @@ class GridMemory(Memory):
     """
 
     settings_type: ClassVar[type] = GridSettings
+    changeable = frozenset(("imagined", "least_new", "edges", "closing"))  # which imagined pixels are written
     settings: GridSettings
 
     def __init__(self, settings: GridSettings, encoder: Encoder, reference: FrameOfReference) -> None:
