@@ -118,13 +118,13 @@ class GridMemory(Memory):
         on_cpu = observations.depth.device.type == "cpu"
         step = max(1, (PIXELS_ON_CPU if on_cpu else PIXELS_ON_GPU) // observations.depth[0].numel())
         for origin, frames in observations.by_origin():
-            if origin == Origin.IMAGINED and self.settings.imagined == "never":
+            rule = self.settings.imagined if origin == Origin.IMAGINED else None
+            if rule == "never":
                 continue
-            once = origin == Origin.IMAGINED and self.settings.imagined == "once"
-            length = 1 if once else step
+            length = 1 if rule == "once" else step
             for begin in range(0, len(frames), length):
                 part = frames[begin : begin + length]
-                self._pool(part if origin == Origin.OBSERVED else self._unknown(part), origin, once)
+                self._pool(self._unknown(part) if rule else part, origin, rule == "once")
 
     def read(self, cameras: Cameras, budget: int) -> MemoryTokens:
         """Return at most ``budget`` cells that reach into the view of a camera, the nearest to such a camera first."""
