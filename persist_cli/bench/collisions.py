@@ -26,7 +26,7 @@ from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.observations import Frame, Observations, TrajectoryInfo
 from persist_cli.api.simulator import Simulator, random_ground
 from persist_cli.checkpoints.contamination import ShownScene, refuse_training_scenes, scenes_to_avoid
-from persist_cli.checkpoints.load import load_adapter, load_backbone
+from persist_cli.checkpoints.load import checked_sampling, load_adapter, load_backbone
 from persist_cli.checkpoints.placement import check_placement
 from persist_cli.episodes.true_scene import observations_of
 from persist_cli.errors import DataError
@@ -127,11 +127,10 @@ def run_collisions(path: Path | None, plan: CollisionPlan, out: Path, as_json: b
     check_simulator(plan.scenes.simulator)
     checkpoint = find_checkpoint(path or reference_checkpoint())
     adapters = chosen_adapters(plan, checkpoint)
-    sampling = checkpoint.sampling_with(plan.sampling)
+    sampling = checked_sampling(checkpoint, plan.sampling)
     check_file(out)
     with busy("loading the model"):
         backbone = load_backbone(checkpoint)
-    backbone.check_sampling(sampling)
     houses = walk_houses(plan, backbone.image_size, checkpoint)
     counts = measure(houses, checkpoint, backbone, adapters, sampling, plan.placement)
     result = collision_json(plan, checkpoint, sampling, houses, counts)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from persist_cli.api.checkpoint import CODEC_ALONE, GUIDE, PLAIN, Checkpoint, find_checkpoint, read_card
-from persist_cli.api.inference import CONSISTENCY
+from persist_cli.api.inference import CONSISTENCY, SamplingOverrides
 from persist_cli.api.scene import Scene
 from persist_cli.checkpoints.lineage import MEMORY_FILE, RECIPE
 from persist_cli.checkpoints.scene_models import with_absolute_model, with_model_beside
@@ -51,6 +51,17 @@ def empty_backbone(checkpoint: Checkpoint, settings: dict[str, Any] | None = Non
     guide = checkpoint.base_folder / GUIDE
     backbone.guide_folder = guide if guide.is_dir() else None
     return backbone
+
+
+def checked_sampling(checkpoint: Checkpoint, overrides: SamplingOverrides) -> Sampling:
+    """Return the sampling of the checkpoint's card with these overrides, checked before any weights are read.
+
+    Raises:
+        PersistError: when the backbone cannot sample so.
+    """
+    sampling = checkpoint.sampling_with(overrides)
+    empty_backbone(checkpoint).check_sampling(sampling)
+    return sampling
 
 
 def load_adapter(backbone: Backbone, checkpoint: Checkpoint, adapter: str | None) -> None:

@@ -34,14 +34,14 @@ PLAN_MEMORIES = "none,voxel,simulator"
 
 bench_app = typer.Typer(no_args_is_help=True, help="Measure plans, collisions and imagined scenes in held-out houses.")
 
-# options of what draws scenes
-RENDERING = ("checkpoint", "denoising_steps", "sampler", "guidance", "autoguidance", "dtype", "save_memory")
+# options of the model that draws scenes
+RENDERING = ("denoising_steps", "sampler", "guidance", "autoguidance", "dtype", "save_memory")
 
 OF_PARTS = {  # parts of `bench scene` that have a use for options
     "seeds": ("completion", "walk", "return", "evolution"),
     "walk_steps": ("walk",), "walks": ("walk", "return"), "return_steps": ("return",), "memories": ("return",),
     "edits": ("edits",), "interactions": ("evolution",), "train": ("completion",), "houses": ("completion",),
-    **dict.fromkeys(RENDERING, ("return", "edits")),
+    **dict.fromkeys(("checkpoint", *RENDERING), ("return", "edits")),
 }  # fmt: skip
 
 
@@ -250,7 +250,7 @@ def bench_scene(
     chosen, rendering = split_names(parts), None
     refuse_other_parts(context, chosen)
     if checkpoint is None:
-        unused = " ".join(("memories", "return_steps", *RENDERING[1:]))
+        unused = " ".join(("memories", "return_steps", *RENDERING))
         refuse_options(context, unused, "only with --checkpoint, whose model draws scenes")
     else:
         sampling = SamplingOverrides(denoising_steps, sampler, guidance, autoguidance=autoguidance)

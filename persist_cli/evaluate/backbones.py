@@ -9,7 +9,7 @@ from pathlib import Path
 from persist_cli.api.backbone import Backbone, Sampling
 from persist_cli.api.checkpoint import Checkpoint
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
-from persist_cli.checkpoints.load import load_backbone
+from persist_cli.checkpoints.load import empty_backbone, load_backbone
 from persist_cli.data.clips import check_size
 from persist_cli.data.store import Store
 from persist_cli.errors import CheckpointError
@@ -57,16 +57,17 @@ class BaseProperties:
 def check_bases(
     checkpoints: Sequence[Checkpoint], data: Sequence[Path], samplings: Sequence[Sampling], loader: BackboneLoader
 ) -> BaseProperties:
-    """Load every base once, the first one last, and check that it takes the images and can be sampled so.
+    """Check that every base takes the images and can be sampled so, then load each once, the first one last.
 
     Raises:
-        PersistError: one line for the first that does not fit, and when clips are not equally long.
+        PersistError: one line for the first that does not fit or is damaged, and when clips are not equally long.
     """
     files = [(file.info, f"{folder}#{file.name}") for folder in data for file in Store(folder)]
+    bases = unique_bases(checkpoints)
     bases_by_length: dict[int, Checkpoint] = {}
     depthless = set()
-    for base in reversed(unique_bases(checkpoints)):
-        backbone = loader.load(base)
+    for base in reversed(bases):
+        backbone = empty_backbone(base)
         for sampling in samplings:
             backbone.check_sampling(sampling)
         for info, where in files:
@@ -79,6 +80,8 @@ def check_bases(
             f"{base.folder} predicts clips of {frames} frames" for frames, base in bases_by_length.items()
         )
         raise CheckpointError(f"{lengths}: they share no clips; evaluate them apart")
+    for base in reversed(bases):
+        loader.load(base)
     return BaseProperties(next(iter(bases_by_length)), frozenset(depthless))
 
 

@@ -17,7 +17,7 @@ from persist_cli.api.memory import Memory
 from persist_cli.api.memory_file import read_header
 from persist_cli.api.observations import TrajectoryInfo
 from persist_cli.api.scene import Scene
-from persist_cli.checkpoints.load import adapter_memory, empty_backbone, load_backbone
+from persist_cli.checkpoints.load import adapter_memory, checked_sampling, empty_backbone, load_backbone
 from persist_cli.data.clips import check_size
 from persist_cli.data.reference import parse_reference
 from persist_cli.errors import CheckpointError
@@ -124,9 +124,8 @@ def world_with(
         PersistError: when model, sampling and data do not go together.
     """
     check_size(info, empty_backbone(checkpoint).image_size, options.start)
+    sampling = checked_sampling(checkpoint, options.sampling)
     backbone = load_backbone(checkpoint, adapter=adapter)
-    sampling = checkpoint.sampling_with(options.sampling)
-    backbone.check_sampling(sampling)
     backbone.prepare_inference(options.placement)
     agent = Agent(memory and memory.placed(backbone.device), options.seed, options.write, body=body_for(options, info))
     return WorldModel(backbone, [agent], sampling)

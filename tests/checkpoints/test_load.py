@@ -2,6 +2,9 @@
 
 import json
 
+import pytest
+
+from persist_backbones.cogvideox.cogvideox import CogVideoX
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.checkpoints.load import load_backbone
 from persist_cli.io.files import read_tensors
@@ -30,3 +33,16 @@ def test_a_trained_video_model_is_not_built_anew_by_settings_over_it(persist, wa
     assert "backbone.settings.transformer.num_layers: base" in result.err
     assert result.err.endswith("built with another; leave it out\n")
     assert not (tmp_path / "run").exists()
+
+
+def test_a_sampling_that_cannot_be_is_refused_before_weights_are_read(
+    persist, walks, held_out, stage1, monkeypatch, tmp_path
+):
+    monkeypatch.setattr(CogVideoX, "load_base", lambda *_: pytest.fail("weights were read"))
+    for command in (
+        ("rollout", stage1, "--start", f"{walks}#0:0", "--actions", "left"),
+        ("eval", stage1, "--data", held_out, "--memories", "none", "--metrics", "psnr"),
+        ("bench", "collisions", stage1, "--memories", "stage1"),
+    ):
+        result = persist(*command, "--sampler", "euler", "--out", tmp_path / "o.json")
+        assert (result.code, "unknown sampler 'euler'" in result.err) == (1, True), result.err

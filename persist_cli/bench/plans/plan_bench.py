@@ -18,7 +18,7 @@ from persist_cli.api.policy import Policy
 from persist_cli.api.simulator import Simulator
 from persist_cli.bench.plans.journal import PlanningJournal, check_row_folders
 from persist_cli.checkpoints.contamination import refuse_training_episodes
-from persist_cli.checkpoints.load import adapter_memory, empty_backbone, load_adapter
+from persist_cli.checkpoints.load import adapter_memory, checked_sampling, empty_backbone, load_adapter
 from persist_cli.checkpoints.placement import check_placement
 from persist_cli.episodes.episodes import Episode, EpisodeSet, read_episodes
 from persist_cli.episodes.find_episodes import EpisodeSearch
@@ -288,7 +288,7 @@ def check_policies(rows: Sequence[PlanningRow], policies: Mapping[str | None, Po
 
 def check_model(checkpoint: Checkpoint, rows: Sequence[PlanningRow], sampling: SamplingOverrides) -> None:
     """Raise ``PersistError`` when the model lacks the adapter of a row, or cannot sample so."""
-    empty_backbone(checkpoint).check_sampling(checkpoint.sampling_with(sampling))
+    checked_sampling(checkpoint, sampling)
     for row in rows:
         if row.uses_world_model and (adapter := adapter_of(checkpoint, row)) is not None:
             adapter_memory(checkpoint, adapter)
@@ -396,7 +396,6 @@ class RowLoader:
         load_adapter(backbone, checkpoint, adapter)
         backbone.prepare_inference(self.bench.plan.placement)
         sampling = checkpoint.sampling_with(self.bench.plan.sampling)
-        backbone.check_sampling(sampling)
         memory = None if adapter is None else MemoryFactory.of_adapter(checkpoint, adapter, backbone.device)
         return dataclasses.replace(parts, backbone=backbone, factory=memory, sampling=sampling)
 

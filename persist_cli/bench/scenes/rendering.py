@@ -143,7 +143,6 @@ class RendererLoader:
         backbone.prepare_inference(self.plan.placement)
         check_size(self.bench.views[0].info, backbone.image_size, self.bench.plan.data)
         sampling = self.checkpoint.sampling_with(self.plan.sampling)
-        backbone.check_sampling(sampling)
         factory = None
         if row.adapter is not None:
             factory = MemoryFactory.of_adapter(self.checkpoint, row.adapter, backbone.device)

@@ -34,7 +34,7 @@ from persist_cli.bench.scenes.journal import SceneJournal
 from persist_cli.bench.scenes.training_houses import House, read_houses
 from persist_cli.bench.scenes.views import Region, View, near_camera, same_form, true_region
 from persist_cli.checkpoints.contamination import ALLOW, OTHER_DATA, ShownScene, known_names, refuse_training_scenes
-from persist_cli.checkpoints.load import empty_backbone
+from persist_cli.checkpoints.load import checked_sampling
 from persist_cli.checkpoints.scene_models import TrainedSceneModel, find_scene_model
 from persist_cli.data.reference import data_folder, parse_reference
 from persist_cli.data.store import Store, TrajectoryFile
@@ -174,8 +174,7 @@ def prepare(plan: SceneBenchPlan, out: Path) -> SceneBench:
     """
     check_parts(plan)
     if plan.rendering is not None:
-        checkpoint = find_checkpoint(plan.rendering.checkpoint)
-        empty_backbone(checkpoint).check_sampling(checkpoint.sampling_with(plan.rendering.sampling))
+        checked_sampling(find_checkpoint(plan.rendering.checkpoint), plan.rendering.sampling)
     trained = None if plan.model is None else find_scene_model(plan.model)
     files = chosen_files(plan)
     if trained is not None:
