@@ -30,7 +30,7 @@ ABANDONED = 600.0  # seconds without a change after which what an import wrote i
 
 
 class NothingUsableError(DataError):
-    """None of the frames of a trajectory can be used."""
+    """A trajectory in which too few frames can be used."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +42,7 @@ class ImportPlan:
         every: keep every n-th frame.
         step: metres of a step of walking actions to add, ``None`` for the usual one, or for no such actions.
         turn: degrees of a turn of walking actions to add, as ``step``.
-        skip_bad: leave out frames that cannot be used, and trajectories without any other.
+        skip_bad: leave out frames that cannot be used, and trajectories without enough others.
         hold_out: share of the frames at the end of each trajectory that are kept for tests; 0 for none.
         part: ``train`` for the frames before those, ``test`` for all, of which those at the end are held out.
         up: unit vector that points up in the world, ``None`` for the one of the importer.
@@ -73,12 +73,14 @@ class ImportPlan:
         """Number of the first kept frame that is held out.
 
         Raises:
-            DataError: when nothing would be left on one of the sides.
+            NothingUsableError: when nothing would be left on one of the sides.
         """
         length = self.length(trajectory)
         first = length - round(length * self.hold_out)
         if not 0 < first < length:
-            raise DataError(f"{trajectory.name}: --hold-out {self.hold_out:g} of {length} frames leaves a part empty")
+            raise NothingUsableError(
+                f"{trajectory.name}: --hold-out {self.hold_out:g} of {length} frames leaves a part empty"
+            )
         return first
 
     def source(self, trajectory: ForeignTrajectory) -> dict[str, Any]:
@@ -235,19 +237,22 @@ def import_trajectories(
         DataError: for what cannot be used, unless that is left out; and when all trajectories are.
     """
     causes: dict[str, None] = {}  # each once, though the source is read for each part
-    usable: dict[str, int] = {}
+    usable: dict[str, int] | None = None
     if plan.hold_out and plan.skip_bad:  # the share that is held out is one of the usable frames
+        usable = {}
         for trajectory in _whole(importer, source, plan, causes):
             with _left_out(plan, causes):
-                usable[trajectory.name] = plan.count_usable(trajectory)
+                count = plan.count_usable(trajectory)
+                replace(plan, usable=count).first_held_out(trajectory)
+                usable[trajectory.name] = count
     written: list[list[dict[str, Any]]] = []
     for part, folder in plan.parts(out):
         written.append([])
         for trajectory in _whole(importer, source, plan, causes):
-            if usable and trajectory.name not in usable:
+            if usable is not None and trajectory.name not in usable:
                 continue
+            part_of_it = part if usable is None else replace(part, usable=usable[trajectory.name])
             with _left_out(plan, causes):
-                part_of_it = replace(part, usable=usable.get(trajectory.name))
                 written[-1].append(import_trajectory(importer, trajectory, part_of_it, folder))
     rows = [row for part in reversed(written) for row in part]
     if not rows:
@@ -270,10 +275,12 @@ def _whole(importer: Importer, source: Path, plan: ImportPlan, causes: dict[str,
 
 @contextlib.contextmanager
 def _left_out(plan: ImportPlan, causes: dict[str, None]) -> Iterator[None]:
-    """Within the block a trajectory of which nothing can be used is left out; ``causes`` gets why."""
+    """Within the block a trajectory of which too little can be used is left out if asked; ``causes`` gets why."""
     try:
         yield
     except NothingUsableError as error:
+        if not plan.skip_bad:
+            raise
         causes[str(error)] = None
 
 

@@ -126,6 +126,25 @@ def test_a_trajectory_whose_images_are_all_bad_is_left_out_too(options, persist,
     assert not list((tmp_path / "out").rglob("*room-2*"))
 
 
+def test_a_trajectory_too_short_for_the_held_out_share_is_left_out_too(persist, tmp_path) -> None:
+    three_of(write_tum)(tmp_path / "in")
+    for path in sorted((tmp_path / "in/room-2/depth").iterdir())[:-1]:  # one frame is left
+        path.write_bytes(b"")
+    command = ["import", "tum", tmp_path / "in", "--out", tmp_path / "out", "--hold-out", "0.5", "--skip-bad", "--json"]
+    ended = persist(*command)
+    assert ended.code == 0, ended.err
+    assert json.loads(ended.out)["left_out"] == ["room-2: --hold-out 0.5 of 1 frames leaves a part empty"]
+    assert [Store(tmp_path / "out" / part).names for part in ("train", "test")] == [["room-1", "room-3"]] * 2
+
+
+def test_a_single_trajectory_too_short_for_the_held_out_share_is_an_error(persist, tmp_path) -> None:
+    for path in sorted((write_tum(tmp_path / "room") / "depth").iterdir())[:-1]:
+        path.write_bytes(b"")
+    ended = persist("import", "tum", tmp_path / "room", "--out", tmp_path / "out", "--hold-out", "0.5", "--skip-bad")
+    assert (ended.code, (tmp_path / "out").exists()) == (1, False)
+    assert ended.err.endswith("can be used; room: --hold-out 0.5 of 1 frames leaves a part empty\n"), ended.err
+
+
 def test_where_nothing_can_be_used_it_is_an_error(persist, tmp_path) -> None:
     three_of(write_scannet)(tmp_path / "in")
     for path in (tmp_path / "in").glob("*/pose/*"):
