@@ -17,7 +17,7 @@ from persist_cli.api.memory import Memory
 from persist_cli.api.memory_file import read_header
 from persist_cli.api.observations import TrajectoryInfo
 from persist_cli.api.scene import Scene
-from persist_cli.checkpoints.load import adapter_memory, checked_sampling, empty_backbone, load_backbone
+from persist_cli.checkpoints.load import adapter_memory, empty_backbone, load_backbone
 from persist_cli.data.clips import check_size
 from persist_cli.data.reference import parse_reference
 from persist_cli.errors import CheckpointError
@@ -123,8 +123,9 @@ def world_with(
     Raises:
         PersistError: when model, sampling and data do not go together.
     """
-    check_size(info, empty_backbone(checkpoint).image_size, options.start)
-    sampling = checked_sampling(checkpoint, options.sampling)
+    empty, sampling = empty_backbone(checkpoint), checkpoint.sampling_with(options.sampling)
+    check_size(info, empty.image_size, options.start)
+    empty.check_sampling(sampling)
     backbone = load_backbone(checkpoint, adapter=adapter)
     backbone.prepare_inference(options.placement)
     agent = Agent(memory and memory.placed(backbone.device), options.seed, options.write, body=body_for(options, info))
