@@ -22,8 +22,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from persist_cli.api.backbone import Sampling
-from persist_cli.api.checkpoint import REFERENCE, find_checkpoint
+from persist_cli.api.checkpoint import REFERENCE
 from persist_cli.checkpoints.scene_models import find_scene_model
 from persist_cli.reproduce import scene_agents
 from persist_cli.reproduce.commands import COLLECT, run_line, run_main
@@ -54,14 +53,12 @@ class SceneFigures:
         checkpoint: the world model.
         scene_model: run or folder of a trained model of scenes; ``None`` to train one.
         renderer: run of a trained adapter that draws scenes; ``None`` to train one.
-        inventing: options of the world model's sampling on ways there and back.
     """
 
     out: Path
     checkpoint: str = REFERENCE
     scene_model: str | None = None
     renderer: str | None = None
-    inventing: str = ""
 
     @property
     def scene(self) -> str:
@@ -119,18 +116,8 @@ def measuring_commands(figures: SceneFigures) -> Iterator[str]:
     yield bench(interactions, "evolution", "evolution", "--interactions 200")
     for name, checkpoint, memories in (("packaged", packaged, MEMORIES), ("renderer", renderer, "scene")):
         yield bench(paths, "edits", f"edits-{name}", f"--checkpoint {checkpoint}")
-        there_and_back = f"--checkpoint {checkpoint} --memories {memories} {figures.inventing}"
-        yield bench(paths, "return", f"return-{name}", f"{there_and_back} --walks 8")
-    yield bench(paths, "return", "long", f"--checkpoint {renderer} {figures.inventing} --walks 4 --return-steps 500")
-
-
-def sampling_of_returns(checkpoint: str) -> str:
-    """Return the options by which a world model invents: what its card says of returns, else 10 steps of ``ddim``."""
-    sampling = find_checkpoint(Path(checkpoint)).protocol_sampling.get("return", Sampling(steps=10))
-    return (
-        f"--denoising-steps {sampling.steps} --sampler {sampling.sampler} "
-        f"--guidance {sampling.memory_guidance:g} --autoguidance {sampling.autoguidance:g}"
-    )
+        yield bench(paths, "return", f"return-{name}", f"--checkpoint {checkpoint} --memories {memories} --walks 8")
+    yield bench(paths, "return", "long", f"--checkpoint {renderer} --walks 4 --return-steps 500")
 
 
 def identity(figures: SceneFigures) -> dict[str, Any]:
@@ -161,8 +148,7 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--trial", action="store_true", help="every command in its smallest form, in OUT/trial")
     options = parser.parse_args(arguments)
     out, run = (trial_folder(options.out), run_small) if options.trial else (options.out, run_line)
-    inventing = sampling_of_returns(options.checkpoint)
-    figures = SceneFigures(out, options.checkpoint, options.scene_model, options.renderer, inventing)
+    figures = SceneFigures(out, options.checkpoint, options.scene_model, options.renderer)
     keep_plan(figures.out, identity(figures), "*/metrics.json")
     for line in commands(figures):
         run(line)

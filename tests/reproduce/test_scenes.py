@@ -10,9 +10,8 @@ import pytest
 from persist_cli.errors import PersistError
 from persist_cli.recipe import apply_overrides, make_recipe, read_recipe
 from persist_cli.reproduce.plan_file import keep_plan
-from persist_cli.reproduce.scenes import SceneFigures, commands, identity, sampling_of_returns
+from persist_cli.reproduce.scenes import SceneFigures, commands, identity
 from tests.support.command_lines import parse_line
-from tests.support.micro_runs import run_persist
 
 FIGURES = SceneFigures(Path("my runs/scenes"))
 
@@ -35,19 +34,6 @@ def test_edits_have_a_seed_each_and_all_else_is_measured_with_several() -> None:
     measured = [line for line in LINES if line.startswith("bench scene")]
     single = [line for line in measured if "--seeds" not in line]
     assert single == [line for line in measured if "--parts edits" in line]
-
-
-def test_ways_back_are_sampled_as_the_card_of_the_model_says(voxel: Path, tmp_path: Path) -> None:
-    inventing = "--denoising-steps 10 --sampler ddim --guidance 1 --autoguidance 1"
-    assert sampling_of_returns(str(voxel)) == inventing
-    with_card = (str(voxel), "--out", str(tmp_path / "model"), "--sampling-for", "return:steps=3,sampler=dpm")
-    run_persist("export", *with_card)
-    assert (
-        sampling_of_returns(str(tmp_path / "model"))
-        == "--denoising-steps 3 --sampler dpm --guidance 1 --autoguidance 1"
-    )
-    ways = [line for line in commands(replace(FIGURES, inventing=inventing)) if "--parts return" in line]
-    assert len(ways) == len([line for line in ways if inventing in line]) == 3
 
 
 def test_what_is_given_is_measured_and_not_trained() -> None:

@@ -92,7 +92,7 @@ def run_edits(bench: SceneBench, plan: RenderingPlan) -> None:
     todo = [number for number in range(bench.plan.edits) if not bench.journal.has(PART, edit_name(row, number))]
     if not todo:
         return
-    renderer = RendererLoader(bench, plan).load(row)
+    renderer = RendererLoader(bench, plan, "edits").load(row)
     with progress() as bar:
         task = add_task(bar, "editing scenes", len(todo), "edits")
         for number in todo:

@@ -11,7 +11,7 @@ from persist_cli.api.memory import Memory
 from persist_cli.api.scene import Scene
 from persist_cli.api.scene_model import SceneModel
 from persist_cli.bench.scenes.completions import Scenes
-from persist_cli.bench.scenes.scene_bench import RenderingPlan, SceneBench
+from persist_cli.bench.scenes.scene_bench import RENDERED, RenderingPlan, SceneBench
 from persist_cli.bench.scenes.views import View
 from persist_cli.checkpoints.load import load_adapter
 from persist_cli.checkpoints.placement import check_placement
@@ -125,10 +125,11 @@ class RendererLoader:
     Args:
         bench: the benchmark, whose plan has a rendering.
         plan: that rendering.
+        part: of the benchmark, which decides on the sampling.
     """
 
-    def __init__(self, bench: SceneBench, plan: RenderingPlan) -> None:
-        self.bench, self.plan = bench, plan
+    def __init__(self, bench: SceneBench, plan: RenderingPlan, part: str) -> None:
+        self.bench, self.plan, self.protocol = bench, plan, RENDERED[part]
         check_placement(plan.placement)
         self.checkpoint, self.loader = find_checkpoint(plan.checkpoint), BackboneLoader(plan.placement)
 
@@ -142,7 +143,7 @@ class RendererLoader:
         load_adapter(backbone, self.checkpoint, row.adapter)
         backbone.prepare_inference(self.plan.placement)
         check_size(self.bench.views[0].info, backbone.image_size, self.bench.plan.data)
-        sampling = self.checkpoint.sampling_with(self.plan.sampling)
+        sampling = self.checkpoint.sampling_with(self.plan.sampling, self.protocol)
         factory = None
         if row.adapter is not None:
             factory = MemoryFactory.of_adapter(self.checkpoint, row.adapter, backbone.device)

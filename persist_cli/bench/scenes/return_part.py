@@ -70,7 +70,7 @@ COLUMNS: Final = {
 
 def run_returns(bench: SceneBench, plan: RenderingPlan) -> None:
     """Walk there and back from some of the views in every row, once for each seed, but where the journal has it."""
-    loader, rows = RendererLoader(bench, plan), rendered_rows(plan)
+    loader, rows = RendererLoader(bench, plan, "return"), rendered_rows(plan)
     with progress() as bar:
         units = {row.name: list(missing_units(bench, row)) for row in rows}
         task = add_task(bar, "walking there and back", sum(map(len, units.values())), "walks")
@@ -131,7 +131,7 @@ def return_json(bench: SceneBench, plan: RenderingPlan) -> dict[str, Any]:
     draws = Draws.of_scenes(view.scene for view in views)
     true = true_pieces(bench)
     detail = true_detail(true)
-    length = RendererLoader(bench, plan).load(rows[0]).backbone.frames_per_clip - 1
+    length = RendererLoader(bench, plan, "return").load(rows[0]).backbone.frames_per_clip - 1
     figures: dict[str, dict[str, Any]] = {}
     windows, videos = {}, {}
     for row in rows:

@@ -50,7 +50,8 @@ WIDEST: Final = 50.0  # metres around a camera that are measured at most
 
 PARTS: Final = ("completion", "walk", "return", "edits", "speed", "evolution")
 
-RENDERED: Final = ("return", "edits")  # parts that need a checkpoint which draws scenes
+# parts that need a checkpoint which draws scenes, and the protocol of evaluation for whose sampling they ask its card
+RENDERED: Final = {"return": "return", "edits": ""}
 
 EDIT_KINDS: Final = ("remove", "paint", "insert", "move", "copy")  # edit number n is of kind n modulo their count
 
@@ -63,7 +64,7 @@ class RenderingPlan:
         checkpoint: of the world model, with an adapter that draws scenes.
         memories: its adapters that are compared on walks.
         steps: frames of a walk out, and of the way back.
-        sampling: in place of the checkpoint's own.
+        sampling: in place of the checkpoint's own, which may be another one on walks.
         placement: device and precision.
     """
 
@@ -174,7 +175,8 @@ def prepare(plan: SceneBenchPlan, out: Path) -> SceneBench:
     """
     check_parts(plan)
     if plan.rendering is not None:
-        checked_sampling(find_checkpoint(plan.rendering.checkpoint), plan.rendering.sampling)
+        for part in RENDERED.keys() & {*plan.parts}:
+            checked_sampling(find_checkpoint(plan.rendering.checkpoint), plan.rendering.sampling, RENDERED[part])
     trained = None if plan.model is None else find_scene_model(plan.model)
     files = chosen_files(plan)
     if trained is not None:
@@ -303,11 +305,11 @@ def part_identities(
     model = {"model": None if trained is None else trained.fingerprint}
     parts: dict[str, dict[str, Any]] = {"walk": model | {"steps": plan.steps}, "speed": model}
     if plan.rendering is not None:
-        rendering = rendering_identity(plan.rendering)
-        parts["return"] = model | rendering | {"steps": plan.rendering.steps}
-        parts["edits"] = rendering | {"seed": plan.seed, "kinds": EDIT_KINDS}
+        rendering = {part: rendering_identity(plan.rendering, protocol) for part, protocol in RENDERED.items()}
+        parts["return"] = model | rendering["return"] | {"steps": plan.rendering.steps}
+        parts["edits"] = rendering["edits"] | {"seed": plan.seed, "kinds": EDIT_KINDS}
     found = {name: values for name, values in parts.items() if name in plan.parts}
-    if plan.rendering is not None and {*RENDERED} & found.keys():
+    if plan.rendering is not None and RENDERED.keys() & found.keys():
         found |= adapter_identities(plan.rendering)
     if "completion" in plan.parts:
         looked_up = {"training houses": digest([f"{house.scene} {house.sha256}" for house in houses])}
@@ -324,10 +326,10 @@ def digest(names: Sequence[str]) -> str:
     return f"{len(names)}, hash {hashlib.sha256(json.dumps(list(names)).encode()).hexdigest()[:12]}"
 
 
-def rendering_identity(plan: RenderingPlan) -> dict[str, Any]:
+def rendering_identity(plan: RenderingPlan, protocol: str) -> dict[str, Any]:
     """Return JSON values of what draws the frames, but for the adapters; memories may be added."""
     checkpoint = find_checkpoint(plan.checkpoint)
-    sampling = asdict(checkpoint.sampling_with(plan.sampling)) | plan.placement.changes()
+    sampling = asdict(checkpoint.sampling_with(plan.sampling, protocol)) | plan.placement.changes()
     return {"checkpoint": checkpoint.fingerprint, "sampling": sampling}
 
 

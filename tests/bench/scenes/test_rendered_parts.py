@@ -13,9 +13,11 @@ import torch
 
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.checkpoint import find_checkpoint
+from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.scene_edits import Copy, Move
 from persist_cli.bench.scenes.edit_part import MOVED, draw_change
 from persist_cli.bench.scenes.journal import SceneJournal
+from persist_cli.bench.scenes.rendering import RendererLoader, rendered_rows
 from persist_cli.bench.scenes.return_part import (
     WINDOW,
     first_visit,
@@ -27,7 +29,15 @@ from persist_cli.bench.scenes.return_part import (
     walk_values,
     window_figures,
 )
-from persist_cli.bench.scenes.scene_bench import SceneBench, SceneBenchPlan, chosen_files, read_views
+from persist_cli.bench.scenes.scene_bench import (
+    RenderingPlan,
+    SceneBench,
+    SceneBenchPlan,
+    chosen_files,
+    part_identities,
+    prepare,
+    read_views,
+)
 from persist_cli.evaluate.statistics import Draws
 from persist_cli.io.files import read_tensors, write_tensors
 from persist_cli.metrics.fvd import LEAST_FRAMES, LEAST_VIDEOS, Fvd
@@ -62,6 +72,21 @@ def test_a_sampling_that_the_model_cannot_do_is_refused_before_anything_is_measu
     ended = persist("bench", "scene", *options, "--autoguidance", 3, "--out", tmp_path / "out")
     assert (ended.code, "autoguidance of 3: this checkpoint has no guide" in ended.err) == (1, True), ended.err
     assert not (tmp_path / "out").exists()
+
+
+def test_ways_there_and_back_are_sampled_as_the_card_says_of_returns_and_edits_are_not(
+    cell_houses: Path, scene_renderer: Path, tmp_path: Path
+) -> None:
+    model = tmp_path / "model"
+    run_persist("export", str(scene_renderer), "--out", str(model), "--steps", "2", "--sampling-for", "return:steps=3")
+    rendering = RenderingPlan(model, ("scene",), 9, SamplingOverrides(), InferenceOptions())
+    plan = SceneBenchPlan(model=None, data=str(cell_houses), train=None, parts=("return", "edits"), rendering=rendering)
+    bench = prepare(plan, tmp_path / "out")
+    rows = rendered_rows(rendering)
+    sampled = {part: RendererLoader(bench, rendering, part).load(rows[0]).sampling.steps for part in plan.parts}
+    assert sampled == {"return": 3, "edits": 2}
+    said = part_identities(plan, [], None)
+    assert {part: said[part]["sampling"]["steps"] for part in plan.parts} == sampled
 
 
 def test_the_way_back_has_the_poses_of_the_way_out(measured: Path) -> None:
