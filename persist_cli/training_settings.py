@@ -118,8 +118,8 @@ class DataSettings:
         color_jitter: largest relative change of the brightness, and as much of each colour, of clip and memory alike.
         own_writes: share of the samples that begin where the model's own prediction of the frames before ends: these
             are written into the memory (stage 2), and the last of them is the given frame (stages 1 and 2), as in a
-            rollout. The prediction is made in one step from a random noise level. The field has related forms of it:
-            scheduled sampling, self-forcing.
+            rollout. The prediction is made in one step from a random noise level, in a distillation from noise alone.
+            The field has related forms of it: scheduled sampling, self-forcing.
         own_warmup: steps of the training before the first such sample.
         own_segments: clips of such a sample, one after the other; the last one counts, the others are predicted.
         pose_drift: standard deviation in metres of a step of the drift of poses along each axis, from one written

@@ -228,6 +228,8 @@ class Backbone(nn.Module, ABC):
     def predict_once(self, clips: Clips) -> tuple[Tensor, Tensor]:
         """Return the clips as the model predicts them in a single step from a random noise level, without gradients.
 
+        A model that is distilled predicts them as it will be sampled, from noise alone.
+
         Training on own writes puts such frames in the place of true ones, as a rollout would.
 
         Args:

@@ -158,10 +158,10 @@ class CogVideoX(AdaptedBackbone):
         return NoisedClips(clean, noise, noisy, timesteps, image, image_noise)
 
     @torch.no_grad()
-    def predict_once(self, clips: Clips) -> tuple[Tensor, Tensor]:
-        """Return the clips as predicted in one step from the noise levels of training; see ``Backbone``."""
+    def predict_once(self, clips: Clips, draw: DrawTimesteps | None = None) -> tuple[Tensor, Tensor]:
+        """Return the clips as predicted in one step from the noise levels of training, or others; see ``Backbone``."""
         generators, clips = sample_generators(clips.seeds), clips.to(self.device)
-        shown = self.shape.of(clips).drop_padding(self.predict_noised(clips, generators).clean(self.scheduler))
+        shown = self.shape.of(clips).drop_padding(self.predict_noised(clips, generators, draw).clean(self.scheduler))
         colors, depth = self.codec.decode_images(shown, self.settings.depth)
         return to_uint8(colors).cpu(), depth.float().cpu()
 

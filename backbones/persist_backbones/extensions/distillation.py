@@ -57,6 +57,10 @@ class Levels:
         """Draw the timesteps of uniform levels, each sample from its own generator."""
         return draw_among(self.timesteps, generators)
 
+    def strongest(self, generators: list[torch.Generator]) -> Int[Tensor, " batch"]:
+        """Return the first level for each sample: noise alone, from which one step is sampled."""
+        return self.timesteps[:1].expand(len(generators))
+
     def following(self, timesteps: Int[Tensor, " batch"]) -> tuple[Int[Tensor, " batch"], Bool[Tensor, " batch"]]:
         """Return the next timestep of each sample, and whether there is none: its step leads to the clean clip."""
         known = self.timesteps.to(timesteps.device)

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from persist_backbones.cogvideox.cogvideox import CogVideoX
 from persist_backbones.cogvideox.config import CogVideoXSettings
-from persist_backbones.cogvideox.diffusion import SamplingStep
+from persist_backbones.cogvideox.diffusion import DrawTimesteps, SamplingStep
 from persist_backbones.cogvideox.model import Conditions, WorldTransformer
 from persist_backbones.cogvideox.parameter_groups import DISCRIMINATOR
 from persist_backbones.cogvideox.parts import DiffusersParts, save_world
@@ -67,6 +67,10 @@ class ExtendedCogVideoX(CogVideoX):
         if self.discriminator is not None and self.adversarial is not None:
             return adversarial_loss(self, clips, self.discriminator, self.adversarial)
         return super().forward(clips, stage)
+
+    def predict_once(self, clips: Clips, draw: DrawTimesteps | None = None) -> tuple[Tensor, Tensor]:
+        """Return the clips as predicted in one step; a model that is distilled begins with noise, as when sampled."""
+        return super().predict_once(clips, draw if self.distillation is None else self.distillation.levels.strongest)
 
     def distill(self, settings: Distill, teacher: Backbone, target: Backbone) -> None:
         """Let ``forward`` return the loss of consistency distillation; see ``distillation``."""
