@@ -3,7 +3,7 @@
 A checkpoint's folder holds the card ``persist.json``, the backbone's own files and ``adapters/NAME/``. The folder of a
 stage-2 run holds adapters only, and its card says where the base is. The folder of a LoRA run holds the low-rank
 change, and its card says which weights it changes. A run's folder stands for its newest checkpoint, and the name
-``reference`` for the model that comes with the package.
+``reference`` for the model that comes with the package; ``reference-1step`` is the same, distilled to one step.
 """
 
 from __future__ import annotations
@@ -32,6 +32,8 @@ VERSION: Final = 1
 STEP: Final = "step-"  # start of the names of the folders of a run's checkpoints
 PLAIN: Final = "stage1"  # name of the base without any adapter
 REFERENCE: Final = "reference"  # names the model that comes with the package
+ONE_STEP: Final = "reference-1step"  # and this one what was distilled from it to one denoising step
+PACKAGED: Final = (REFERENCE, ONE_STEP)
 STARTED_FROM: Final = "started_from"  # the key of a card for the base of a run that holds all weights itself
 GUIDE: Final = "guide"  # the folder of a weaker version of a checkpoint's video model, for autoguidance
 CODEC_ALONE: Final = "codec_alone"  # the key of a card for a codec that was exported without its video model
@@ -149,7 +151,7 @@ def find_checkpoint(path: Path) -> Checkpoint:
     """Return the checkpoint in a folder, or the newest one of a run.
 
     Args:
-        path: the folder; ``reference`` is the model that comes with the package, unless such a folder is here.
+        path: the folder; ``reference`` and ``reference-1step`` come with the package, unless such folders are here.
 
     Raises:
         CheckpointError: when there is none, its card is damaged, or its base is missing or has other weights.
@@ -175,12 +177,12 @@ def find_checkpoint(path: Path) -> Checkpoint:
 
 
 def checkpoint_folder(path: Path) -> Path:
-    """Return the path, or the folder of the packaged model for ``reference`` unless such a folder is here.
+    """Return the path, or the folder of the packaged model that it names unless such a folder is here.
 
     Raises:
-        CheckpointError: when the packaged model is named and this installation has none.
+        CheckpointError: when a packaged model is named and this installation has none.
     """
-    return reference_checkpoint() if path == Path(REFERENCE) and not path.is_dir() else path
+    return packaged_checkpoint(str(path)) if str(path) in PACKAGED and not path.is_dir() else path
 
 
 def reference_checkpoint() -> Path:
@@ -189,9 +191,18 @@ def reference_checkpoint() -> Path:
     Raises:
         CheckpointError: when this installation does not have it.
     """
-    folder = bundled_folder(REFERENCE)
+    return packaged_checkpoint(REFERENCE)
+
+
+def packaged_checkpoint(name: str) -> Path:
+    """Return the folder of a model of ``PACKAGED``.
+
+    Raises:
+        CheckpointError: when this installation does not have it.
+    """
+    folder = bundled_folder(name)
     if not (folder / CARD).is_file():
-        raise CheckpointError(f"no reference model in {folder}: it comes with the package; give a CHECKPOINT")
+        raise CheckpointError(f"no {name} model in {folder}: it comes with the package; give a CHECKPOINT")
     return folder
 
 
@@ -199,7 +210,7 @@ def base_pointer(card: dict[str, Any]) -> dict[str, Any] | None:
     """Return the part of a card that says which base the checkpoint was trained on; ``None`` when none does.
 
     Returns:
-        A mapping in the card with ``base``, a path relative to the card's folder or ``reference``, and the
+        A mapping in the card with ``base``, a path relative to the card's folder or a name of ``PACKAGED``, and the
         ``fingerprint`` of that base.
     """
     parts = (card, card.get("changes"), card.get(STARTED_FROM))
@@ -219,8 +230,8 @@ def find_base(folder: Path, pointer: Mapping[str, Any]) -> Path:
     """
     wanted = str(pointer.get("fingerprint", ""))
     place = (folder / pointer["base"]).resolve()
-    if pointer["base"] == REFERENCE and not place.is_dir():
-        place = reference_checkpoint()
+    if pointer["base"] in PACKAGED and not place.is_dir():
+        place = packaged_checkpoint(pointer["base"])
     base = find_weights(place, wanted)
     if base is not None:
         return base

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
-from persist_cli.api.checkpoint import CARD, REFERENCE, STARTED_FROM, VERSION, Checkpoint
+from persist_cli.api.checkpoint import CARD, PACKAGED, STARTED_FROM, VERSION, Checkpoint
 from persist_cli.api.inference import CONSISTENCY
 from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.checkpoints.lineage import MEMORY_FILE
@@ -154,6 +154,6 @@ def card_fingerprint(hashes: Mapping[str, str], card: dict[str, Any]) -> str:
 
 def pointer_to(base: Path, fingerprint: str, home: Path) -> dict[str, str]:
     """The values of a card that point to a base: its folder relative to ``home``, or its name, and its fingerprint."""
-    packaged = base.resolve() == bundled_folder(REFERENCE).resolve()
-    place = REFERENCE if packaged else relative_place(base.resolve(), home.resolve())
+    packaged = [name for name in PACKAGED if base.resolve() == bundled_folder(name).resolve()]
+    place = packaged[0] if packaged else relative_place(base.resolve(), home.resolve())
     return {"base": place, "fingerprint": fingerprint}

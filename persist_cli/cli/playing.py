@@ -12,7 +12,6 @@ from persist_cli.cli.options import (
     BodyOption,
     DtypeOption,
     JsonOption,
-    ReferenceArgument,
     SaveMemoryOption,
     StepOption,
     TurnOption,
@@ -43,6 +42,9 @@ DepthModelOption = Annotated[
 ClipFramesOption = Annotated[
     int | None, typer.Option(min=2, help="Of a clip, the present one included; few answer a key soon. The model's.")
 ]
+OneStepArgument = Annotated[
+    Path | None, typer.Argument(help="A finetune run, or a checkpoint folder; else reference-1step.")
+]
 PlayStepsOption = Annotated[
     int | None,
     typer.Option(min=1, max=50, help="Denoising steps; few answer a key soon. A distilled model's own, else 1."),
@@ -58,7 +60,7 @@ OpenOption = Annotated[
 
 @playing_app.command()
 def play(
-    checkpoint: ReferenceArgument = None,
+    checkpoint: OneStepArgument = None,
     start: StartingOption = None,
     memories: MemoriesOption = "",
     memory: RememberedOption = None,
@@ -89,7 +91,7 @@ def play(
 
     persist play runs/model --start runs/houses#0:32 --memories voxel,none --memory runs/houses#0:0-33
     """
-    from persist_cli.api.checkpoint import REFERENCE
+    from persist_cli.api.checkpoint import ONE_STEP
     from persist_cli.memorize.picture import PictureOptions
     from persist_cli.play.open_play import PlayOptions
     from persist_cli.play.serve import ServeOptions, run_play
@@ -100,7 +102,7 @@ def play(
     given = (SAMPLE_FRAMES,) if start is None and not memory else tuple(memory or ())
     begin = StartOptions(start or SAMPLE_START, PictureOptions(depth, depth_model, fov, None), step, turn, body)
     options = PlayOptions(
-        checkpoint=checkpoint or REFERENCE, begin=begin, memories=split_names(memories), given=given,
+        checkpoint=checkpoint or ONE_STEP, begin=begin, memories=split_names(memories), given=given,
         settings=PlaySettings(steps=steps or 1, guidance=guidance, autoguidance=autoguidance, seed=seed, ahead=ahead,
             clip_frames=clip_frames),
         placement=InferenceOptions.of(dtype, save_memory), own_steps=steps is None,

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from persist_cli.api.backbone import Backbone
-from persist_cli.api.checkpoint import PLAIN, REFERENCE, Checkpoint, find_checkpoint
+from persist_cli.api.checkpoint import ONE_STEP, PLAIN, Checkpoint, find_checkpoint
 from persist_cli.api.inference import CONSISTENCY, InferenceOptions, SamplingOverrides
 from persist_cli.api.memory import Memory
 from persist_cli.api.memory_file import is_memory_file, read_header
@@ -31,7 +31,8 @@ class PlayOptions:
     """What is walked in.
 
     Args:
-        checkpoint: a run, an export or ``reference``, the model that comes with the package.
+        checkpoint: a run, an export or the name of a packaged model: ``reference``, or ``reference-1step``, which
+            predicts a clip in one step.
         begin: where the walk begins, and with which actions.
         memories: names of the checkpoint's adapters, or ``stage1`` for none, in the order in which they are shown. The
             first one decides what is in the way. Without any it is the checkpoint's default.
@@ -43,7 +44,7 @@ class PlayOptions:
             those of the settings.
     """
 
-    checkpoint: Path | str = REFERENCE
+    checkpoint: Path | str = ONE_STEP
     begin: StartOptions = field(default_factory=StartOptions)
     memories: tuple[str, ...] = ()
     given: tuple[str, ...] = ()

@@ -12,10 +12,12 @@ import pytest
 
 from persist_backbones import load
 from persist_cli.api.backbone import Sampling
-from persist_cli.api.checkpoint import find_checkpoint, reference_checkpoint
+from persist_cli.api.checkpoint import find_base, find_checkpoint, reference_checkpoint
 from persist_cli.api.inference import SamplingOverrides
 from persist_cli.checkpoints.export import ExportPlan, run_export
+from persist_cli.checkpoints.save import pointer_to
 from persist_cli.data.reference import parse_reference, sample_data
+from persist_cli.errors import CheckpointError
 from persist_cli.memorize.memory_file import load_memory
 from tests.support.export_runs import write_runs, write_weaker
 from tests.support.micro_runs import stage
@@ -95,6 +97,21 @@ def test_a_memory_is_trained_on_the_reference_model_and_finds_it_where_the_packa
     monkeypatch.setenv("PERSIST_REFERENCE", str(here / "elsewhere"))
     assert find_checkpoint(here / "run").base_folder == here / "elsewhere/reference"
     assert persist("relink", "run", "reference").code == 0
+
+
+def test_the_distilled_model_has_a_name_of_its_own_and_what_is_trained_on_it_says_that_name(reference, home, here):
+    with pytest.raises(CheckpointError, match=r"no reference-1step model in .*: it comes with the package"):
+        find_checkpoint(Path("reference-1step"))
+    distilled = home / "reference-1step"
+    shutil.copytree(reference, distilled)
+    try:
+        found = find_checkpoint(Path("reference-1step"))
+        assert found.folder == distilled
+        pointer = pointer_to(distilled, found.fingerprint, here)
+        assert pointer["base"] == "reference-1step"
+        assert find_base(here, pointer) == distilled
+    finally:
+        shutil.rmtree(distilled)
 
 
 def test_a_rollout_with_the_adapter_stage1_is_the_model_without_memory(persist, reference, here):

@@ -1,4 +1,4 @@
-"""The bundled reference model is whole, small enough for git, and better with its memory than without."""
+"""The bundled models are whole, small enough for git, and better with their memory than without."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ import json
 
 import pytest
 
-from persist_cli.api.checkpoint import find_checkpoint, reference_checkpoint
+from persist_cli.api.backbone import Sampling
+from persist_cli.api.checkpoint import ONE_STEP, PACKAGED, find_checkpoint, packaged_checkpoint, reference_checkpoint
+from persist_cli.api.inference import CONSISTENCY
 from persist_cli.checkpoints.lineage import training_scenes
-from persist_cli.checkpoints.load import empty_backbone
+from persist_cli.checkpoints.load import adapter_memory, empty_backbone
 from tests.support.packaged_models import check_files, check_sample_is_unseen
 
-MOST_BYTES = 40e6
+MOST_BYTES = {"reference": 25e6, "reference-1step": 15e6}  # 40 MB together
 
 BACK = ("--start", "sample#0:32", "--follow", "--frames", 16, "--seed", 0)
 
@@ -23,8 +25,17 @@ def packaged(monkeypatch):
     return reference_checkpoint()
 
 
-def test_every_file_has_its_hash_and_all_are_small_enough(packaged):
-    check_files(packaged, MOST_BYTES)
+@pytest.mark.parametrize("name", PACKAGED)
+def test_every_file_has_its_hash_and_all_are_small_enough(packaged, name):
+    check_files(packaged_checkpoint(name), MOST_BYTES[name])
+
+
+def test_the_distilled_model_takes_one_step_and_has_the_same_memories(packaged):
+    whole, distilled = find_checkpoint(packaged), find_checkpoint(packaged_checkpoint(ONE_STEP))
+    assert distilled.sampling == Sampling(1, CONSISTENCY)
+    assert distilled.default == whole.default
+    memories = [{name: adapter_memory(one, name) for name in one.adapters} for one in (whole, distilled)]
+    assert memories[0] == memories[1]
 
 
 def test_what_is_invented_in_evaluations_is_sampled_away_from_its_guide(packaged):
@@ -35,15 +46,17 @@ def test_what_is_invented_in_evaluations_is_sampled_away_from_its_guide(packaged
         empty_backbone(checkpoint).check_sampling(sampling)
 
 
-def test_the_sample_shows_houses_that_it_was_not_trained_on(packaged):
-    check_sample_is_unseen(training_scenes(find_checkpoint(packaged)))
+@pytest.mark.parametrize("name", PACKAGED)
+def test_the_sample_shows_houses_that_it_was_not_trained_on(packaged, name):
+    check_sample_is_unseen(training_scenes(find_checkpoint(packaged_checkpoint(name))))
 
 
-def test_with_memory_the_way_back_is_closer_to_the_truth_than_without(packaged, persist, tmp_path):
+@pytest.mark.parametrize("name", PACKAGED)
+def test_with_memory_the_way_back_is_closer_to_the_truth_than_without(packaged, persist, tmp_path, name):
     assert persist("memorize", "sample#0:0-33", "--out", tmp_path / "house.safetensors").code == 0
     means = []
     for options in (("--memory", tmp_path / "house.safetensors"), ("--adapter", "none")):
-        ended = persist("rollout", *BACK, *options, "--out", tmp_path / "back")
+        ended = persist("rollout", name, *BACK, *options, "--out", tmp_path / "back")
         assert ended.code == 0, ended.err
         psnr = json.loads((tmp_path / "back/rollout.json").read_text())["against_ground_truth"]["psnr"]
         means.append(sum(psnr) / len(psnr))
