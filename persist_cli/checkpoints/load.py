@@ -53,13 +53,13 @@ def empty_backbone(checkpoint: Checkpoint, settings: dict[str, Any] | None = Non
     return backbone
 
 
-def checked_sampling(checkpoint: Checkpoint, overrides: SamplingOverrides, protocol: str = "") -> Sampling:
-    """Return what ``Checkpoint.sampling_with`` does, checked before any weights are read.
+def checked_sampling(checkpoint: Checkpoint, overrides: SamplingOverrides) -> Sampling:
+    """Return the sampling of the checkpoint's card with these overrides, checked before any weights are read.
 
     Raises:
         PersistError: when the backbone cannot sample so.
     """
-    sampling = checkpoint.sampling_with(overrides, protocol)
+    sampling = checkpoint.sampling_with(overrides)
     empty_backbone(checkpoint).check_sampling(sampling)
     return sampling
 

@@ -34,7 +34,7 @@ from persist_cli.bench.scenes.journal import SceneJournal
 from persist_cli.bench.scenes.training_houses import House, read_houses
 from persist_cli.bench.scenes.views import Region, View, near_camera, same_form, true_region
 from persist_cli.checkpoints.contamination import ALLOW, OTHER_DATA, ShownScene, known_names, refuse_training_scenes
-from persist_cli.checkpoints.load import checked_sampling
+from persist_cli.checkpoints.load import empty_backbone
 from persist_cli.checkpoints.scene_models import TrainedSceneModel, find_scene_model
 from persist_cli.data.reference import data_folder, parse_reference
 from persist_cli.data.store import Store, TrajectoryFile
@@ -175,8 +175,7 @@ def prepare(plan: SceneBenchPlan, out: Path) -> SceneBench:
     """
     check_parts(plan)
     if plan.rendering is not None:
-        for part in RENDERED.keys() & {*plan.parts}:
-            checked_sampling(find_checkpoint(plan.rendering.checkpoint), plan.rendering.sampling, RENDERED[part])
+        check_samplings(plan.rendering, plan.parts)
     trained = None if plan.model is None else find_scene_model(plan.model)
     files = chosen_files(plan)
     if trained is not None:
@@ -189,6 +188,15 @@ def prepare(plan: SceneBenchPlan, out: Path) -> SceneBench:
         events = find_events(plan.data, {view.scene for view in views}, plan.interactions, plan.seed)
     journal.begin(identity(plan, views), part_identities(plan, houses, trained))
     return SceneBench(plan=plan, views=views, houses=houses, journal=journal, trained=trained, events=events)
+
+
+def check_samplings(plan: RenderingPlan, parts: Sequence[str]) -> None:
+    """Raise ``PersistError`` when the world model cannot sample as a part asks it to, before weights are read."""
+    checkpoint = find_checkpoint(plan.checkpoint)
+    backbone = empty_backbone(checkpoint)
+    for part in parts:
+        if part in RENDERED:
+            backbone.check_sampling(checkpoint.sampling_with(plan.sampling, RENDERED[part]))
 
 
 def check_model(trained: TrainedSceneModel, files: Sequence[TrajectoryFile], allowed: bool) -> None:
