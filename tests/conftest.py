@@ -74,9 +74,13 @@ Persist = Callable[..., CommandResult]
 
 
 @pytest.fixture
-def persist(capsys: pytest.CaptureFixture[str]) -> Persist:
-    """The command line, run in this process."""
+def persist(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
+) -> Persist:
+    """The command line, run in this process, in a folder of its own: where a command writes by default is locked."""
     from persist_cli.cli.app import main
+
+    monkeypatch.chdir(tmp_path_factory.mktemp("cwd"))
 
     def run(*arguments: object) -> CommandResult:
         capsys.readouterr()
