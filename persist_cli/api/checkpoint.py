@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from persist_cli.api.inference import SamplingOverrides
 from persist_cli.api.training_scenes import TrainingScenes
-from persist_cli.errors import CheckpointError
+from persist_cli.errors import CheckpointError, nearest_name
 from persist_cli.io.command_line import quoted
 from persist_cli.io.files import bundled_folder, read_json
 from persist_cli.io.sha256sums import check_sums
@@ -295,7 +295,11 @@ def model_folder(path: Path) -> Path:
         return own
     steps = step_folders(path)
     if not steps:
-        raise CheckpointError(f"{path}: no checkpoint there (neither persist.json nor a finetune run's step-* folder)")
+        nearest = None if path.exists() else nearest_name(str(path), PACKAGED)
+        meant = f"; did you mean {nearest!r}?" if nearest else ""
+        raise CheckpointError(
+            f"{path}: no checkpoint there (neither persist.json nor a finetune run's step-* folder){meant}"
+        )
     return steps[-1] / "model"
 
 

@@ -99,6 +99,14 @@ def test_a_memory_is_trained_on_the_reference_model_and_finds_it_where_the_packa
     assert persist("relink", "run", "reference").code == 0
 
 
+def test_a_misspelt_name_of_a_packaged_model_is_answered_with_the_nearest_one(here):
+    with pytest.raises(CheckpointError, match=r"step-\* folder\); did you mean 'reference-1step'\?$"):
+        find_checkpoint(Path("reference-1stp"))
+    (here / "reference-1stp").mkdir()
+    with pytest.raises(CheckpointError, match=r"step-\* folder\)$"):  # a folder is what was meant
+        find_checkpoint(Path("reference-1stp"))
+
+
 def test_the_distilled_model_has_a_name_of_its_own_and_what_is_trained_on_it_says_that_name(reference, home, here):
     with pytest.raises(CheckpointError, match=r"no reference-1step model in .*: it comes with the package"):
         find_checkpoint(Path("reference-1step"))
