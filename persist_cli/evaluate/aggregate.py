@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from persist_cli.evaluate.cases import Case
-from persist_cli.evaluate.columns import Column, chosen_frames, make_columns, without_known_poses
+from persist_cli.evaluate.columns import Column, chosen_clips, chosen_frames, make_columns, without_known_poses
 from persist_cli.evaluate.journal import TRUTH
 from persist_cli.evaluate.metric_suite import CELLS, FEATURES, FIGURES, READS, WEIGHTS, MetricSuite, make_setup
 from persist_cli.evaluate.plan import Evaluation
@@ -208,9 +208,9 @@ class Table:
             results: row of the cell.
             figures: figures by row and column; the first row is the one of ``difference``.
         """
-        obstacles = self.obstacles(results)
-        if column.metric in obstacles:
-            return {"na": obstacles[column.metric]}
+        obstacle = self.obstacle(column, results)
+        if obstacle is not None:
+            return {"na": obstacle}
         figure = figures[results.row.group][column.name]
         if not np.isfinite(figure.mean):
             return {"na": "not defined for any of these clips"}
@@ -232,16 +232,25 @@ class Table:
         """Reasons why metrics cannot be measured of a row, or of the clips of this table alone, by name."""
         return self.own_obstacles[results.suite.setup.generated_depth] | results.suite.obstacles
 
+    def obstacle(self, column: Column, results: RowResults) -> str | None:
+        """The reason why a column cannot be measured of a row, ``None`` when it can."""
+        set_metric = results.suite.set_metrics.get(column.metric)
+        obstacle = self.obstacles(results).get(column.metric)
+        if obstacle is not None or set_metric is None:
+            return obstacle
+        clips = int(chosen_clips(self.cases, column).sum())
+        return set_metric.obstacle(replace(results.suite.setup, clips=clips))
+
     def figures(self, results: RowResults) -> dict[str, Figure]:
         """The figure of every column that can be measured."""
-        suite, figures, obstacles = results.suite, {}, self.obstacles(results)
+        suite, figures = results.suite, {}
         for column in self.columns:
-            if column.metric in obstacles:
+            if self.obstacle(column, results) is not None:
                 continue
             if column.metric in suite.frame_metrics:
                 figures[column.name] = self.frame_figure(column, results)
             elif column.metric in suite.set_metrics:
-                figures[column.name] = self.set_figure(column.metric, results)
+                figures[column.name] = self.set_figure(column, results)
             elif column.metric in suite.frame_set_metrics:
                 figures[column.name] = self.frame_set_figure(column.metric, results)
         return figures
@@ -281,16 +290,18 @@ class Table:
         weighted = results.suite.is_weighted(metric)
         return values, results.gather(WEIGHTS + metric)[:, :, clips] if weighted else torch.ones_like(values)
 
-    def set_figure(self, metric: str, results: RowResults) -> Figure:
-        """The distance of the row's videos from the true ones."""
-        generated, truth = self.features(metric, results)
-        set_metric = results.suite.set_metrics[metric]
+    def set_figure(self, column: Column, results: RowResults) -> Figure:
+        """The distance of the row's videos from the true ones, over the clips that the column takes."""
+        generated, truth = self.features(column.metric, results)
+        set_metric = results.suite.set_metrics[column.metric]
+        taken = chosen_clips(self.cases, column).numpy()
 
         def distance(counts: Counts, model: int, seed: int) -> float:
-            chosen = torch.from_numpy(np.repeat(np.arange(len(counts)), counts))
-            return set_metric.distance(generated[model, seed][chosen], truth[chosen])
+            chosen = torch.from_numpy(np.repeat(np.arange(len(counts)), counts * taken))
+            return set_metric.distance(generated[model, seed][chosen], truth[chosen]) if len(chosen) > 1 else np.nan
 
-        return set_figure(distance, self.draws(results, SET_RESAMPLES), len(results.seeds))
+        draws = self.draws(results, SET_RESAMPLES)
+        return set_figure(distance, draws, len(results.seeds), np.where(taken, draws.clusters, -1))
 
     def features(self, metric: str, results: RowResults) -> tuple[Tensor, Tensor]:
         """Features of the row's videos ``[model, seed, clip, …]`` and of the true ones ``[clip, …]``."""

@@ -14,16 +14,18 @@ from torch import Tensor
 from persist_cli.evaluate.cases import Case
 from persist_cli.evaluate.protocols import FrameSelection, Protocol
 from persist_cli.evaluate.windows import CURVE_COLUMNS
-from persist_cli.metrics.metric import FrameMetric, Metric
+from persist_cli.metrics.metric import FrameMetric, Metric, SetMetric
 
 ENDS: tuple[FrameSelection, ...] = ("all", "last", "return")
 
 SELECTIONS: dict[str, tuple[FrameSelection, ...]] = {  # of metrics shown over more than all frames
     "psnr": (*ENDS, "new", "seen"), "sharpness": (*ENDS, "new"), "ssim": ENDS, "dreamsim": ENDS,
-    "lpips-alex": (*ENDS, "seen"), "lpips-vgg": (*ENDS, "seen"),
+    "lpips-alex": (*ENDS, "seen"), "lpips-vgg": (*ENDS, "seen"), "fvd": ("all", "seen"),
 }  # fmt: skip
 
 FAMILIAR = 0.9  # share of a view seen before from which on nothing of it counts as new
+
+WHOLLY_SEEN = f"at least {FAMILIAR:.0%} was seen before"
 
 SUFFIXES: dict[FrameSelection, tuple[str, str, str]] = {
     "all": ("", "", "mean over the predicted frames"),
@@ -34,7 +36,7 @@ SUFFIXES: dict[FrameSelection, tuple[str, str, str]] = {
         "at the frames only that return to an earlier place over more than one predicted clip",
     ),
     "new": ("-new", " where new", f"at frames of whose view less than {FAMILIAR:.0%} was seen before only"),
-    "seen": ("-seen", " where seen", f"at frames of whose view at least {FAMILIAR:.0%} was seen before only"),
+    "seen": ("-seen", " where seen", f"at frames of whose view {WHOLLY_SEEN} only"),
 }
 
 
@@ -68,7 +70,9 @@ def make_columns(metrics: Mapping[str, Metric], protocol: Protocol) -> list[Colu
                 continue
             suffix, title, words = SUFFIXES[selection]
             definition = metric.definition
-            if isinstance(metric, FrameMetric):
+            if isinstance(metric, SetMetric) and selection == "seen":
+                definition = f"as {metric.title}, of the clips only of whose every predicted view {WHOLLY_SEEN}"
+            elif isinstance(metric, FrameMetric):
                 definition = f"{definition}; {words}" if selection == "all" else f"as {metric.title}, {words}"
             columns.append(Column(name + suffix, name, metric.title + title, metric.better, definition, selection))
         curve = CURVE_COLUMNS.get(name)
@@ -106,6 +110,11 @@ def chosen_frames(
         chosen = shares < FAMILIAR if frames == "new" else shares >= FAMILIAR
     chosen[:, 0] = False
     return chosen
+
+
+def chosen_clips(cases: Sequence[Case], column: Column) -> Bool[Tensor, " clip"]:
+    """A mask of the clips whose videos a column of a distance between sets of them takes."""
+    return chosen_frames(cases, "seen" if column.frames == "seen" else "all")[:, 1:].all(1)
 
 
 def without_known_poses(metrics: Iterable[FrameMetric], cases: Sequence[Case], figures: Tensor) -> Tensor:
