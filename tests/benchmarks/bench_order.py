@@ -1,12 +1,13 @@
-"""Why image snapshots stand above the top-down map here, and not below it as in the paper: what lifting by depth gives.
+"""Why the memories have another order here than in the paper: what lifting by depth gives, and what height gives.
 
     persist collect miniworld --out runs/test/path --scenes 0:12 --frames 129 --split test --policy path
     python tests/benchmarks/bench_order.py --data runs/test/path --out runs/order.json
 
 The reference model on clips of held-out houses whose memory holds all true frames before them. Snapshots are measured
 as they are, with every patch at its measured depth, and with every patch at one distance along the camera's axis, as
-an image without depth could be placed. Target frames near a frame in memory are not counted. Prints a table of means
-and of differences from snapshots with 95 % intervals over houses; asserts nothing.
+an image without depth could be placed. The voxel map is measured as it is, and with cells as wide as before and
+higher, up to one for all heights as in the top-down map. Target frames near a frame in memory are not counted. Prints a
+table of means and of differences from snapshots with 95 % intervals over houses; asserts nothing.
 """
 
 from __future__ import annotations
@@ -45,19 +46,24 @@ class AtOneDistance(Model):
         return super().remembered(dataclasses.replace(example, earlier=earlier))
 
 
-def build_rows(checkpoint: Path, sampling: Sampling, distances: list[float]) -> dict[str, Model]:
+def build_rows(options: argparse.Namespace) -> dict[str, Model]:
     """The rows to measure, by name; those of one backbone."""
-    found = find_checkpoint(checkpoint)
+    found, sampling = find_checkpoint(options.checkpoint), Sampling(options.steps, options.sampler)
     backbone = load_backbone(found)
     backbone.eval()
     rows: dict[str, Model] = {}
     for name in MEMORIES:
         backbone.load_adapter(name, found.adapter_folder(name))
         rows[name] = Model(backbone, adapter_memory(found, name), name, sampling)
-    for metres in distances:
+    for metres in options.distances:
         row = AtOneDistance(backbone, adapter_memory(found, "snapshots"), "snapshots", sampling)
         row.metres = metres
         rows[f"snapshots, all at {metres:g} m"] = row
+    voxel = adapter_memory(found, "voxel")
+    for metres in options.heights:
+        width, _, depth = voxel.settings["cell"]
+        higher = dataclasses.replace(voxel, settings=voxel.settings | {"cell": [width, metres, depth]})
+        rows[f"voxel, cells {metres:g} m high"] = Model(backbone, higher, "voxel", sampling)
     return rows
 
 
@@ -67,12 +73,13 @@ def main() -> None:
     parser.add_argument("--data", type=Path, nargs="+", required=True)
     parser.add_argument("--checkpoint", type=Path, default=reference_checkpoint(), help="by default the packaged model")
     parser.add_argument("--distances", type=float, nargs="*", default=[1.5, 2.5, 4.0], help="metres")
+    parser.add_argument("--heights", type=float, nargs="*", default=[0.1, 0.25, 0.5, 1.0, 3.0], help="of cells, metres")
     parser.add_argument("--each", type=int, default=1, help="clips of each trajectory")
     parser.add_argument("--steps", type=int, default=4)
     parser.add_argument("--sampler", default="unipc")
     parser.add_argument("--out", type=Path, help="figures of each clip, JSON, written after each of them")
     arguments = parser.parse_args()
-    rows = build_rows(arguments.checkpoint, Sampling(arguments.steps, arguments.sampler), arguments.distances)
+    rows = build_rows(arguments)
     houses: list[str] = []
     figures: dict[str, list[dict[str, float]]] = {name: [] for name in rows}
     with torch.no_grad():
