@@ -4,7 +4,8 @@
 each memory a short time with each of a few settings and measures them on houses that are neither of the training nor of
 the test split. It then measures the best of them with other steps, samplers and guidance. So no memory is compared by
 choices that were made for another. It stops and goes on like ``make table1``: what is done is not done again, and
-with another base, other data, steps or clips it refuses.
+with another base, other data, steps or clips it refuses. With ``--steps 0`` nothing is trained: memories that are drawn
+into the views are measured as their adapters begin, as those of the packaged model are.
 
 ``OUT/choices.json`` has what was chosen and every trial, ``choices.md`` the same as a table, and ``OUT/recipes`` has a
 recipe for each memory with what was chosen. They are written anew after each figure, and say of which split the houses
@@ -56,6 +57,14 @@ def frames(count: int, patch: int) -> tuple[str, ...]:
 
 
 WIDER: Final = ("adapter.head_width=192",)
+WIDER_NAME: Final = "-wider-head"  # ends the names of trials that train nothing else than a wider head
+
+SMALL: Final = ("adapter.head_width=16", "adapter.head_layers=1", "adapter.attention_tokens=0")
+UNTRAINED: Final = (  # one step that changes no weight, with learned parts that only take time as small as can be
+    "training.steps=1", "training.batch=1", "training.learning_rate=1e-12", "training.warmup=0", "training.cooldown=0",
+    "training.ema=0",
+)  # fmt: skip
+DRAWN: Final = ("voxel", "map2d", "snapshots")  # into the views, and of use before any training
 
 # for each memory what is tried on top of its recipe: resolution, and the head where it has one
 TRIALS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
@@ -94,7 +103,7 @@ class Plan:
         data: folders of the training houses.
         validation: folders of the validation houses.
         memories: names of the memories.
-        steps: optimizer steps of each trial.
+        steps: optimizer steps of each trial; 0 for adapters as they begin.
         clips: most clips that a trial is measured on.
     """
 
@@ -162,8 +171,9 @@ def default_validation(out: Path) -> tuple[Path, ...]:
 def train_command(plan: Plan, memory: str, name: str) -> str:
     """The command line that trains a memory with the settings of a trial, on from where it stopped."""
     data = " ".join(f"--data {shlex.quote(str(folder))}" for folder in plan.data)
-    cooldown = plan.steps // 3
-    settings = [*TRIALS[memory][name], f"training.steps={plan.steps}", f"training.cooldown={cooldown}"]
+    training = [f"training.steps={plan.steps}", f"training.cooldown={plan.steps // 3}"]
+    small = SMALL if memory in DRAWN else ()
+    settings = [*TRIALS[memory][name], *(training if plan.steps else (*UNTRAINED, *small))]
     changes = shlex.join([f"base={plan.base}", *settings])
     cache = shlex.quote(str(plan.out / "cache"))
     run = shlex.quote(str(run_folder(plan, memory, name)))
@@ -207,10 +217,15 @@ def measure(plan: Plan, memory: str, name: str, sampling: Sampling) -> Trial:
     return Trial(name, TRIALS[memory][name], sampling, figures, len(table.clips), len(scenes))
 
 
+def trial_names(plan: Plan, memory: str) -> list[str]:
+    """The names of the settings to try; a wider head that nothing trains is none."""
+    return [name for name in TRIALS[memory] if plan.steps or not name.endswith(WIDER_NAME)]
+
+
 def trials_of(plan: Plan, memory: str) -> Iterator[list[Trial]]:
     """Yield the trials of a memory so far, after each one: settings first, then guidance, then steps and sampler."""
     trials: list[Trial] = []
-    for name in TRIALS[memory]:
+    for name in trial_names(plan, memory):
         trials.append(measure(plan, memory, name, FIRST))
         yield trials
     for guidance in GUIDANCES[1:] if memory != "none" else ():  # of a memory that gives nothing it changes nothing
@@ -353,16 +368,18 @@ def run_choose(plan: Plan) -> None:
     say(f"\n{table_text(choices)}")
 
 
-def memories_of(text: str) -> tuple[str, ...]:
+def memories_of(text: str, steps: int) -> tuple[str, ...]:
     """The memories named in a list separated by commas.
 
     Raises:
-        PersistError: when there is nothing to choose for one.
+        PersistError: when there is nothing to choose for one, or in ``steps`` of 0 it could be of no use.
     """
     names = tuple(dict.fromkeys(name.strip() for name in text.split(",")))
     for name in names:
         if name not in TRIALS:
             raise PersistError(f"no choices for memory {name!r}; {hint(name, list(TRIALS))}")
+        if not steps and name not in ("none", *DRAWN):
+            raise PersistError(f"memory {name!r} is of no use before it is trained; take it out, or give --steps 400")
     return names
 
 
@@ -378,11 +395,11 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--data", action="append", type=Path, required=True, help="training houses; may be repeated")
     parser.add_argument("--validation", action="append", type=Path, help="validation houses; collected by default")
     parser.add_argument("--memories", default=",".join(TRIALS), help="separated by commas")
-    parser.add_argument("--steps", type=int, default=Plan.steps, help="optimizer steps of a trial")
+    parser.add_argument("--steps", type=int, default=Plan.steps, help="optimizer steps of a trial; 0 for none")
     parser.add_argument("--clips", type=int, default=Plan.clips, help="most clips of an evaluation")
     options = parser.parse_args(arguments)
     validation = tuple(options.validation or default_validation(options.out))
-    memories = memories_of(options.memories)
+    memories = memories_of(options.memories, options.steps)
     for memory in memories:
         make_recipe(read_recipe(f"{RECIPE}{memory}"), f"{RECIPE}{memory}")
     plan = Plan(

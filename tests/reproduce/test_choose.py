@@ -34,6 +34,7 @@ from persist_cli.reproduce.choose import (
     result_folder,
     run_choose,
     train_command,
+    trial_names,
     trials_of,
 )
 from tests.support.command_lines import parse_line
@@ -64,6 +65,19 @@ def test_every_trial_is_a_recipe_and_commands_that_persist_takes(memory: str, tm
             eval_command(asked, memory, name, FIRST),
         ):
             parse_line(line)
+
+
+@pytest.mark.parametrize("memory", ["none", "voxel", "map2d", "snapshots"])
+def test_without_steps_adapters_stay_as_they_begin(memory: str, tmp_path: Path) -> None:
+    asked = replace(plan(tmp_path, memory), steps=0)
+    for name in trial_names(asked, memory):
+        words = shlex.split(train_command(asked, memory, name))
+        recipe = make_recipe(apply_overrides(read_recipe(words[1]), [word for word in words[2:] if "=" in word]), name)
+        assert (recipe.training.steps, recipe.training.learning_rate, recipe.training.ema) == (1, 1e-12, 0)
+        assert recipe.adapter["head_width"] == (160 if memory == "none" else 16)
+    assert trial_names(asked, memory) == [name for name in TRIALS[memory] if "wider" not in name]
+    with pytest.raises(PersistError, match=r"memory 'views' is of no use before it is trained"):
+        memories_of(f"{memory},views", 0)
 
 
 def test_only_validation_houses_are_measured(tmp_path: Path) -> None:
@@ -207,6 +221,6 @@ def test_before_anything_is_chosen_an_error_says_what_chooses(tmp_path: Path) ->
 
 
 def test_a_memory_without_choices_is_an_error_that_names_the_nearest() -> None:
-    assert memories_of("voxel, none,voxel") == ("voxel", "none")
+    assert memories_of("voxel, none,voxel", 400) == ("voxel", "none")
     with pytest.raises(PersistError, match="no choices for memory 'voxels'; did you mean 'voxel'"):
-        memories_of("voxels")
+        memories_of("voxels", 400)
