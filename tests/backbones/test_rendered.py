@@ -8,6 +8,7 @@ import torch
 from persist_backbones.adapters.rendered import RenderedSettings, render_views, tokens_not_shown
 from persist_backbones.cogvideox.diffusion import noise_level
 from persist_backbones.tensors import push_pull
+from persist_cli.api.backbone import Sampling
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.geometry import unproject
 from persist_cli.api.observations import Origin
@@ -169,6 +170,22 @@ def test_a_fresh_adapter_trusts_drawn_colours_less_the_larger_their_error_and_de
     sure, unsure = (clean_of(backbone, clips, wall(), 300)[0] - bare for backbone in (sure, unsure))
     assert unsure[:, :, :4].abs().mean() < 0.6 * sure[:, :, :4].abs().mean()
     assert torch.equal(unsure[:, :, 4:], sure[:, :, 4:])
+
+
+def test_a_clip_costs_one_encoding_more_than_without_memory_in_however_many_steps(monkeypatch):
+    backbone, clips, encodings = micro(), random_clips(), []
+    encode = backbone.codec.encode
+    monkeypatch.setattr(backbone.codec, "encode", lambda *frames: encodings.append(frames) or encode(*frames))
+
+    def encodings_of(steps):
+        encodings.clear()
+        backbone.generate(clips, Sampling(steps))
+        return len(encodings)
+
+    assert [encodings_of(1), encodings_of(4)] == [1, 1]
+    with_adapter(backbone, form="rendered")
+    clips = dataclasses.replace(clips, tokens=random_tokens(2, 60))
+    assert [encodings_of(1), encodings_of(4)] == [2, 2]
 
 
 def test_latents_that_are_kept_stand_for_the_tokens_they_were_rendered_from():

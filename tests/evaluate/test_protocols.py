@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from persist_cli.api.geometry import near_poses, pose_differences
+from persist_cli.data.reference import sample_data
 from persist_cli.data.store import Store, write_trajectory
 from persist_cli.errors import DataError
 from persist_cli.evaluate.cases import read_case
@@ -28,6 +29,13 @@ def search(folder, frames=0, scenes=(), new_poses=NEW_POSES):
         folders=[folder], frames=frames, limit=8, predicted_at_once=8, training_scenes=frozenset(scenes),
         new_poses=new_poses,
     )  # fmt: skip
+
+
+def test_on_the_way_back_of_the_packaged_sample_every_frame_counts(monkeypatch):
+    monkeypatch.delenv("PERSIST_REFERENCE")
+    cases = PROTOCOLS["revisit"].find(search(sample_data()))
+    assert cases
+    assert all(all(case.counted[1:]) for case in cases)
 
 
 def world_from_camera(case):
