@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING
 import pytest
 
 from persist_cli.data.store import Store
+from persist_cli.play.guide import Guide
 from persist_cli.play.play import Play
 from persist_cli.play.sessions import Limits
 from persist_cli.play.settings import Shown
 from persist_cli.reproduce.pages import CHROMIUM, driven_chromium
 from persist_cli.reproduce.play_picture import frame_number, hold, wait_for_frame
+from persist_cli.rollout.world_model import WorldModel
 from tests.support.browser import watched
 from tests.support.micro_plays import micro_walks
 from tests.support.pixel_cost import PixelCost
@@ -162,10 +164,18 @@ def test_a_tab_that_is_closed_frees_its_session_and_another_one_walks(browser: B
             assert frame_number(page) >= 2
 
 
+class TurningGuide(Guide):
+    """Never comes to the goal; where the agent stands, which depends on how fast the page was, it may be there."""
+
+    def decide(self, world: WorldModel) -> tuple[str, ...]:
+        return ("left",)
+
+
 def test_the_planner_walks_to_a_goal_picture_until_it_is_stopped(
     browser: Browser, server: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("persist_cli.play.play.make_cost", lambda name, settings: PixelCost(settings))
+    monkeypatch.setattr("persist_cli.play.play.Guide", TurningGuide)
     with opened(browser, server) as page:
         page.keyboard.press("g")
         page.wait_for_selector("#goal-picture", state="visible")
