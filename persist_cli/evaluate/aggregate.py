@@ -294,14 +294,14 @@ class Table:
         """The distance of the row's videos from the true ones, over the clips that the column takes."""
         generated, truth = self.features(column.metric, results)
         set_metric = results.suite.set_metrics[column.metric]
-        taken = chosen_clips(self.cases, column).numpy()
+        draws = self.draws(results, SET_RESAMPLES)
+        known = np.where(chosen_clips(self.cases, column).numpy(), draws.clusters, -1)
 
         def distance(counts: Counts, model: int, seed: int) -> float:
-            chosen = torch.from_numpy(np.repeat(np.arange(len(counts)), counts * taken))
-            return set_metric.distance(generated[model, seed][chosen], truth[chosen]) if len(chosen) > 1 else np.nan
+            chosen = torch.from_numpy(np.repeat(np.arange(len(counts)), counts))
+            return set_metric.distance(generated[model, seed][chosen], truth[chosen])
 
-        draws = self.draws(results, SET_RESAMPLES)
-        return set_figure(distance, draws, len(results.seeds), np.where(taken, draws.clusters, -1))
+        return set_figure(distance, draws, len(results.seeds), known)
 
     def features(self, metric: str, results: RowResults) -> tuple[Tensor, Tensor]:
         """Features of the row's videos ``[model, seed, clip, …]`` and of the true ones ``[clip, …]``."""
@@ -313,9 +313,10 @@ class Table:
         generated, truth = self.features(metric, results)
         draws = self.draws(results, SET_RESAMPLES)
         taken = truth.isfinite().all(-1)
+        known = np.where(taken.any(1).numpy(), draws.clusters, -1)
         clusters = torch.from_numpy(draws.clusters)
         places, scenes = torch.unique(clusters[:, None].expand_as(taken)[taken], return_inverse=True)
-        firsts = [draws.clusters.tolist().index(place) for place in places.tolist()]
+        firsts = [known.tolist().index(place) for place in places.tolist()]
         shown = torch.from_numpy(self.scene_numbers[firsts])
         apart = shown[:, None] != shown  # clips of one scene are no pairs where clips are drawn, either
         frame_set_metric = results.suite.frame_set_metrics[metric]
@@ -330,7 +331,6 @@ class Table:
             total, pairs = (weights @ (matrix * apart) @ weights for matrix in sums[model, seed])
             return float(total / pairs) if pairs > 0 else float("nan")
 
-        known = np.where(taken.any(1).numpy(), draws.clusters, -1)
         return set_figure(distance, draws, len(results.seeds), known)
 
     def curves(self, results: RowResults) -> dict[str, Any]:

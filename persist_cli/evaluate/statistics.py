@@ -244,10 +244,13 @@ def set_figure(distance: Distance, draws: Draws, seeds: int, known: Counts | Non
         distance: distance of the clips, each counted so often, from the true ones, of a model at a sampling seed.
         draws: draws of clips and models.
         seeds: number of sampling seeds; every bootstrap sample is a mean over all of them, as the figure is.
-        known: clusters with -1 where a clip does not take part; ``None`` when all do.
+        known: clusters with -1 where a clip does not take part, which then counts 0 times; ``None`` when all do.
     """
+    known = draws.clusters if known is None else known
+    taken = known >= 0
 
-    def known_distance(counts: Counts, model: int, seed: int) -> float:
+    def known_distance(drawn: Counts, model: int, seed: int) -> float:
+        counts = drawn * taken
         return distance(counts, model, seed) if counts.sum() > 1 else float("nan")
 
     once = np.ones(draws.clips.shape[1], np.int64)
@@ -264,7 +267,7 @@ def set_figure(distance: Distance, draws: Draws, seeds: int, known: Counts | Non
             for clips, models in zip(draws.clips, draws.models, strict=True)
         ]
     )
-    return make_figure(by_seed, moved_to(by_seed, drawn), draws.clusters if known is None else known)
+    return make_figure(by_seed, moved_to(by_seed, drawn), known)
 
 
 def moved_to(by_seed: Array, drawn: Array) -> Array:
