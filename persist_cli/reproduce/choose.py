@@ -57,14 +57,15 @@ def frames(count: int, patch: int) -> tuple[str, ...]:
 
 
 WIDER: Final = ("adapter.head_width=192",)
-WIDER_NAME: Final = "-wider-head"  # ends the names of trials that train nothing else than a wider head
 
-SMALL: Final = ("adapter.head_width=16", "adapter.head_layers=1", "adapter.attention_tokens=0")
-UNTRAINED: Final = (  # one step that changes no weight, with learned parts that only take time as small as can be
+DRAWN: Final = ("voxel", "map2d", "snapshots")  # into the views, and of use before any training
+SMALL: Final = (  # learned parts of these, which only take time as long as nothing trains them
+    "adapter.head_width=16", "adapter.head_layers=1", "adapter.attention_tokens=0",
+)  # fmt: skip
+UNTRAINED: Final = (  # one step that changes no weight
     "training.steps=1", "training.batch=1", "training.learning_rate=1e-12", "training.warmup=0", "training.cooldown=0",
     "training.ema=0",
 )  # fmt: skip
-DRAWN: Final = ("voxel", "map2d", "snapshots")  # into the views, and of use before any training
 
 # for each memory what is tried on top of its recipe: resolution, and the head where it has one
 TRIALS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
@@ -171,10 +172,11 @@ def default_validation(out: Path) -> tuple[Path, ...]:
 def train_command(plan: Plan, memory: str, name: str) -> str:
     """The command line that trains a memory with the settings of a trial, on from where it stopped."""
     data = " ".join(f"--data {shlex.quote(str(folder))}" for folder in plan.data)
-    training = [f"training.steps={plan.steps}", f"training.cooldown={plan.steps // 3}"]
-    small = SMALL if memory in DRAWN else ()
-    settings = [*TRIALS[memory][name], *(training if plan.steps else (*UNTRAINED, *small))]
-    changes = shlex.join([f"base={plan.base}", *settings])
+    if plan.steps:
+        settings = [f"training.steps={plan.steps}", f"training.cooldown={plan.steps // 3}"]
+    else:
+        settings = [*UNTRAINED, *(SMALL if memory in DRAWN else ())]
+    changes = shlex.join([f"base={plan.base}", *TRIALS[memory][name], *settings])
     cache = shlex.quote(str(plan.out / "cache"))
     run = shlex.quote(str(run_folder(plan, memory, name)))
     return f"finetune {RECIPE}{memory} {data} --out {run} --resume --cache {cache} {changes}"
@@ -219,7 +221,7 @@ def measure(plan: Plan, memory: str, name: str, sampling: Sampling) -> Trial:
 
 def trial_names(plan: Plan, memory: str) -> list[str]:
     """The names of the settings to try; a wider head that nothing trains is none."""
-    return [name for name in TRIALS[memory] if plan.steps or not name.endswith(WIDER_NAME)]
+    return [name for name, settings in TRIALS[memory].items() if plan.steps or not {*WIDER} & {*settings}]
 
 
 def trials_of(plan: Plan, memory: str) -> Iterator[list[Trial]]:
