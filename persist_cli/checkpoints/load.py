@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +12,7 @@ from persist_cli.api.inference import CONSISTENCY, SamplingOverrides
 from persist_cli.api.scene import Scene
 from persist_cli.checkpoints.lineage import MEMORY_FILE, RECIPE
 from persist_cli.checkpoints.scene_models import with_absolute_model, with_model_beside
-from persist_cli.errors import CheckpointError, RecipeError
+from persist_cli.errors import CheckpointError, PersistError, RecipeError
 from persist_cli.io.files import read_json
 from persist_cli.io.settings import parse_settings
 from persist_cli.output.console import warn
@@ -61,7 +61,23 @@ def checked_sampling(checkpoint: Checkpoint, overrides: SamplingOverrides) -> Sa
     """
     sampling = checkpoint.sampling_with(overrides)
     empty_backbone(checkpoint).check_sampling(sampling)
+    check_noise(sampling, [checkpoint])
     return sampling
+
+
+def check_noise(sampling: Sampling, checkpoints: Iterable[Checkpoint]) -> None:
+    """Raise ``PersistError`` when a sampling declares more noise than any of these models or their adapters knows."""
+    if sampling.context_noise <= 0:
+        return
+    known, place = 0.0, None
+    for checkpoint in checkpoints:
+        backbone, place = empty_backbone(checkpoint), place or checkpoint.folder
+        known = max(known, *(backbone.known_noise(folder) for folder in (None, *checkpoint.adapters.values())))
+    if sampling.context_noise > known:
+        raise PersistError(
+            f"context noise of {sampling.context_noise:g}: {place} was trained with levels up to {known:g}, see "
+            "backbone.settings.image_noise and adapter.noise"
+        )
 
 
 def load_adapter(backbone: Backbone, checkpoint: Checkpoint, adapter: str | None) -> None:
@@ -163,26 +179,34 @@ def named_adapter(text: str) -> tuple[Checkpoint, str]:
     return checkpoint, chosen
 
 
-def start_backbone(config: BackboneConfig, base: Checkpoint | None, fresh: bool = False) -> Backbone:
-    """The backbone that a training begins with: a fresh one, or that of the base with the config's settings on top.
+def start_backbone(recipe: Recipe, base: Checkpoint | None) -> Backbone:
+    """The backbone that a training begins with: a fresh one, or that of the base with the recipe's settings on top.
 
-    Of a base that is a codec alone, the config may change the video model: that is then a fresh one.
+    On a base that is a codec alone, stage 1 trains a fresh video model of the recipe's settings and seed.
 
     Args:
-        config: the backbone of the recipe.
+        recipe: the recipe.
         base: the checkpoint that the training starts from.
-        fresh: of a base that is a codec alone, the video model is a fresh one of this training's seed in any case.
 
     Raises:
-        RecipeError: when the base is of another backbone than the config, or was built by other settings.
+        RecipeError: when the base is of another backbone than the recipe's, was built by other settings, or has no
+            trained video model for a memory or LoRA to be trained on.
     """
     from persist_cli.plugins import load_plugin, make_backbone
 
+    config = recipe.backbone
     if base is None:
         return make_backbone(config.name, config.settings)
     if base.backbone != config.name:
         raise RecipeError(f"base {base.folder} is of backbone {base.backbone!r}, not {config.name!r}")
-    if fresh and takes_codec_alone(base) and is_own_codec(base):
+    codec_alone = takes_codec_alone(base) and is_own_codec(base)
+    if codec_alone and (recipe.memory is not None or recipe.lora is not None):
+        raise RecipeError(
+            f"base {base.folder}: a codec alone, whose video model was not trained; train stage 1 on it, and name that"
+        )
+    if recipe.memory is not None:
+        check_frozen(config, base)
+    if codec_alone and recipe.stage == "1":
         return fresh_on_codec(base, config.settings)
     built_by = load_plugin("backbone", config.name).built_by
     changed = changed_settings(base.settings, {key: config.settings[key] for key in built_by if key in config.settings})
@@ -193,6 +217,24 @@ def start_backbone(config: BackboneConfig, base: Checkpoint | None, fresh: bool 
             f"backbone.settings.{changed[0]}: base {base.folder} is a model that was built with another; leave it out"
         )
     return fresh_on_codec(base, config.settings)
+
+
+def check_frozen(config: BackboneConfig, base: Checkpoint) -> None:
+    """Check the settings of a base whose video model stays as it is: a checkpoint of an adapter keeps none of its own.
+
+    Raises:
+        RecipeError: when the config has others than the base.
+    """
+    kind = load_plugin("backbone", base.backbone)
+    own = parse_settings(kind.settings_type, base.settings, f"base {base.folder}")
+    new = parse_settings(kind.settings_type, merge_settings(base.settings, config.settings), "backbone.settings")
+    for field in dataclasses.fields(own):
+        before, now = getattr(own, field.name), getattr(new, field.name)
+        if before != now and field.name not in kind.for_training:
+            raise RecipeError(
+                f"backbone.settings.{field.name}: base {base.folder} has {before!r}, and stage 2 leaves its video "
+                f"model as it is; leave it out, or train stage 1 on with {now!r}"
+            )
 
 
 def takes_codec_alone(checkpoint: Checkpoint) -> bool:

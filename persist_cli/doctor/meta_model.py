@@ -55,7 +55,7 @@ class MetaModel:
         """The meta model of a recipe and its base, where there is one."""
         channels = None
         with torch.device("meta"):
-            backbone = start_backbone(recipe.backbone, base)
+            backbone = start_backbone(recipe, base)
             if recipe.lora is not None:
                 backbone.add_lora(recipe.lora)
             if recipe.memory is not None:

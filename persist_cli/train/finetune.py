@@ -345,7 +345,7 @@ def prepare_backbone(recipe: Recipe, base: Checkpoint | None, factory: MemoryFac
     Raises:
         RecipeError: when LoRA has no weights to change.
     """
-    backbone = start_backbone(recipe.backbone, base, fresh=recipe.stage == "1" and recipe.lora is None)
+    backbone = start_backbone(recipe, base)
     if recipe.lora is not None:
         if base is None and not backbone.origin():
             raise RecipeError("lora changes weights that are there; give base=RUN, or pretrained backbone.settings")
