@@ -122,6 +122,14 @@ class Backbone(nn.Module, ABC):
                 "puts a weaker version of the model beside it"
             )
 
+    def known_noise(self, adapter: Path | None = None) -> float:
+        """Return the highest noise level that the model was trained to be told; infinite if it was not counted.
+
+        Args:
+            adapter: folder of ``save_adapter``: that of this adapter, not of the model without one.
+        """
+        return math.inf
+
     def check_clip_frames(self, frames: int) -> None:
         """Raise ``PersistError`` with one line when ``generate`` cannot make clips of so many frames.
 

@@ -38,6 +38,7 @@ from persist_cli.checkpoints.lineage import (
 )
 from persist_cli.checkpoints.load import (
     adapter_memory,
+    check_noise,
     empty_backbone,
     fresh_on_codec,
     is_own_codec,
@@ -271,7 +272,7 @@ def _default_adapter(base: Checkpoint, adapters: dict[str, AdapterSource], reque
 
 
 def _sampled_as(adapters: Mapping[str, AdapterSource], base: Checkpoint, requested: SamplingOverrides) -> Checkpoint:
-    """The base with the sampling that its adapters ask for: a distilled one has its own, on any base.
+    """The base with these adapters and the sampling that they ask for: a distilled one has its own, on any base.
 
     Raises:
         CheckpointError: when they ask for several and the options leave it open.
@@ -287,7 +288,12 @@ def _sampled_as(adapters: Mapping[str, AdapterSource], base: Checkpoint, request
         return base
     warn_of_plain(base, next(iter(samplings.values())))
     asked = next(iter(adapters.values())).checkpoint
-    return dataclasses.replace(base, sampling=asked.sampling, protocol_sampling=asked.protocol_sampling)
+    return dataclasses.replace(
+        base,
+        adapters={name: adapter.folder for name, adapter in adapters.items()},
+        sampling=asked.sampling,
+        protocol_sampling=asked.protocol_sampling,
+    )
 
 
 def _default_sampling(base: Checkpoint, plan: ExportPlan) -> dict[str, Any] | None:
@@ -308,6 +314,7 @@ def _check_sampling(base: Checkpoint, plan: ExportPlan, sampling: Sampling) -> N
     backbone = empty_backbone(base)
     backbone.guide_folder = plan.guide or backbone.guide_folder
     backbone.check_sampling(sampling)
+    check_noise(sampling, [base])
 
 
 def _guide_json(base: Checkpoint, guide: Checkpoint | None) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from persist_cli.api.backbone import Backbone, Sampling
 from persist_cli.api.checkpoint import Checkpoint
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
-from persist_cli.checkpoints.load import empty_backbone, load_backbone
+from persist_cli.checkpoints.load import check_noise, empty_backbone, load_backbone
 from persist_cli.data.clips import check_size
 from persist_cli.data.store import Store
 from persist_cli.errors import CheckpointError
@@ -62,6 +62,8 @@ def check_bases(
     Raises:
         PersistError: one line for the first that does not fit or is damaged, and when clips are not equally long.
     """
+    for sampling in samplings:
+        check_noise(sampling, checkpoints)
     files = [(file.info, f"{folder}#{file.name}") for folder in data for file in Store(folder)]
     bases = unique_bases(checkpoints)
     bases_by_length: dict[int, Checkpoint] = {}

@@ -17,7 +17,7 @@ from persist_cli.api.memory import Memory
 from persist_cli.api.memory_file import read_header
 from persist_cli.api.observations import TrajectoryInfo
 from persist_cli.api.scene import Scene
-from persist_cli.checkpoints.load import adapter_memory, empty_backbone, load_backbone
+from persist_cli.checkpoints.load import adapter_memory, check_noise, empty_backbone, load_backbone
 from persist_cli.data.clips import check_size
 from persist_cli.data.reference import parse_reference
 from persist_cli.errors import CheckpointError
@@ -126,6 +126,7 @@ def world_with(
     empty, sampling = empty_backbone(checkpoint), checkpoint.sampling_with(options.sampling)
     check_size(info, empty.image_size, options.start)
     empty.check_sampling(sampling)
+    check_noise(sampling, [checkpoint])
     backbone = load_backbone(checkpoint, adapter=adapter)
     backbone.prepare_inference(options.placement)
     agent = Agent(memory and memory.placed(backbone.device), options.seed, options.write, body=body_for(options, info))

@@ -10,11 +10,21 @@ import torch
 
 from persist_backbones.noise_levels import add_level, draw_levels, fill_with_noise
 from persist_cli.api.backbone import Clips, Sampling
+from persist_cli.api.checkpoint import find_checkpoint
+from persist_cli.api.inference import SamplingOverrides
 from persist_cli.api.tokens import MemoryTokens
+from persist_cli.checkpoints.load import check_noise, checked_sampling
 from persist_cli.errors import PersistError
+from tests.support.export_runs import write_adapter, write_base
 from tests.support.micro_model import equal, micro, predicted_of, random_clips, random_tokens, shaken, with_adapter
 
 FORMS = ["cross", "projected", "canvas", "rendered"]
+
+
+def write_noisy(folder: Path, image: float, memory: float) -> Path:
+    """A voxel adapter whose memory was noisy in training, on a base whose given frame was."""
+    backbone = write_base(folder / "base", image_noise=image)
+    return write_adapter(backbone, folder / "base", folder / "voxel", "voxel", noise=memory)
 
 
 def generators() -> list[torch.Generator]:
@@ -130,9 +140,26 @@ def test_the_given_frame_of_each_training_sample_is_noisy_and_the_target_is_not(
     assert torch.equal(inputs[0.5][:, 1:, given], inputs[0.0][:, 1:, given])
 
 
-def test_a_level_that_was_never_trained_is_refused() -> None:
-    with pytest.raises(PersistError, match=r"^context noise of 0.3; this model was trained with levels up to 0, see"):
-        micro().check_sampling(Sampling(context_noise=0.3))
+def test_a_level_that_was_never_trained_is_refused(tmp_path: Path) -> None:
+    model = find_checkpoint(write_noisy(tmp_path, image=0.1, memory=0.4))
+    for level in (0.0, 0.1, 0.4):
+        assert checked_sampling(model, SamplingOverrides(context_noise=level)).context_noise == level
+    with pytest.raises(PersistError, match=r"^context noise of 0.5: .*/voxel was trained with levels up to 0.4, see"):
+        checked_sampling(model, SamplingOverrides(context_noise=0.5))
+    base = find_checkpoint(tmp_path / "base")
+    with pytest.raises(PersistError, match=r"^context noise of 0.4: .*/base was trained with levels up to 0.1, see"):
+        checked_sampling(base, SamplingOverrides(context_noise=0.4))
+    check_noise(Sampling(context_noise=0.4), [base, model])  # a row of the base is told no more than it knows
     with pytest.raises(PersistError, match=r"^context noise of -1.0; it must be a number of at least 0$"):
         micro().check_sampling(Sampling(context_noise=-1.0))
-    with_adapter(micro(), noise=0.5).check_sampling(Sampling(context_noise=0.3))
+
+
+@pytest.mark.parametrize("memories", ["stage1,voxel", "voxel"])
+def test_an_evaluation_declares_the_noise_that_only_its_memory_knows(persist, held_out, tmp_path, memories):
+    model = write_noisy(tmp_path, image=0.0, memory=0.5)
+    options = ["--metrics", "psnr", "--controls", "copy", "--seeds", 1, "--clips", 1, "--steps", 1]
+    command = ["eval", model, "--data", held_out, "--memories", memories, *options]
+    ended = persist(*command, "--context-noise", 0.3, "--out", tmp_path / "o")
+    assert ended.code == 0, ended.err
+    ended = persist(*command, "--context-noise", 0.6, "--out", tmp_path / "p")
+    assert (ended.code, "context noise of 0.6" in ended.err) == (1, True)

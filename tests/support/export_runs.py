@@ -35,9 +35,11 @@ def write_weaker(stage1: Path, folder: Path, scale: float = 0.02) -> Path:
     return folder
 
 
-def write_adapter(backbone: Backbone, base: Path, folder: Path, memory: str, form: str = "cross") -> Path:
+def write_adapter(
+    backbone: Backbone, base: Path, folder: Path, memory: str, form: str = "cross", **settings: Any
+) -> Path:
     """Write a stage-2 run on a base; returns its folder."""
-    backbone.add_adapter(memory, CHANNELS, SMALL | {"form": form})
+    backbone.add_adapter(memory, CHANNELS, SMALL | {"form": form} | settings)
     shaken(backbone.adapters[memory])  # type: ignore[index]
     folder.mkdir()
     config = MemoryConfig(memory, {"cell": (0.5, 1.0, 0.5)} if memory == "voxel" else {}, "patches", ENCODER)

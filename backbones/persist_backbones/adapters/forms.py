@@ -24,6 +24,7 @@ FORMS: dict[str, type[Adapter[Any]]] = {
     "frames": FramesAdapter,
 }  # fmt: skip
 DEFAULT = "cross"
+CARD = "adapter.json"  # its settings, beside its weights
 # the paper's blocks on CogVideoX-5B, one after every transformer block; the paper says only that they have about 1 B
 # parameters together; here a third of the video's width, heads of its size, and a feed-forward of half its width
 PRESETS: dict[str, dict[str, Any]] = {"5b": {"form": "cross", "every": 1, "width": 1024, "heads": 16, "ff_factor": 0.5}}
@@ -80,7 +81,7 @@ def _with_preset(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 def save_adapter(adapter: Adapter[Any], folder: Path) -> None:
     """Write an adapter's settings and weights into an existing folder."""
-    write_json(folder / "adapter.json", {"channels": adapter.channels} | dataclasses.asdict(adapter.settings))
+    write_json(folder / CARD, {"channels": adapter.channels} | dataclasses.asdict(adapter.settings))
     write_tensors(folder / "adapter.safetensors", adapter.state_dict())
 
 
@@ -90,11 +91,28 @@ def load_adapter(folder: Path, video: VideoShape) -> Adapter[Any]:
     Raises:
         PersistError: one line naming the file when one is missing, corrupt or does not fit the model.
     """
-    card, path = folder / "adapter.json", folder / "adapter.safetensors"
-    settings = read_json(card)
-    if not isinstance(settings, dict) or not isinstance(settings.get("channels"), int):
-        raise CheckpointError(f"{card}: not the card of an adapter")
+    card, path = folder / CARD, folder / "adapter.safetensors"
+    settings = _read_card(card)
     tensors, _ = read_tensors(path)
     adapter = make_adapter(settings.pop("channels"), settings, video, str(card))
     load_exactly(adapter, tensors, set(adapter.state_dict()), path)
     return adapter
+
+
+def trained_noise(folder: Path) -> float:
+    """Return the highest noise level of the memory in training, of the adapter that ``save_adapter`` wrote.
+
+    Raises:
+        PersistError: one line naming the file when its card is missing or corrupt.
+    """
+    card = folder / CARD
+    settings = _read_card(card)
+    del settings["channels"]
+    return float(parse_settings(_form_of(settings).settings_type, settings, str(card)).noise)
+
+
+def _read_card(card: Path) -> dict[str, Any]:
+    settings = read_json(card)
+    if not isinstance(settings, dict) or not isinstance(settings.get("channels"), int):
+        raise CheckpointError(f"{card}: not the card of an adapter")
+    return settings

@@ -15,7 +15,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from persist_backbones.adapters.base import Adapter, AdapterCondition, MemoryCondition, VideoShape
+from persist_backbones.adapters.base import AdapterCondition, MemoryCondition, VideoShape
+from persist_backbones.adapters.forms import trained_noise
 from persist_backbones.cogvideox.adapted import AdaptedBackbone
 from persist_backbones.cogvideox.codec import Codec, frames_to_batch, to_uint8
 from persist_backbones.cogvideox.codec_start import start_as_components
@@ -68,7 +69,7 @@ from persist_cli.api.checkpoint import lora_base
 from persist_cli.api.clips import ClipLatents
 from persist_cli.api.inference import CONSISTENCY
 from persist_cli.api.stages import ParameterGroup, Stage
-from persist_cli.errors import CheckpointError, PersistError
+from persist_cli.errors import CheckpointError
 
 
 class CogVideoX(AdaptedBackbone):
@@ -343,13 +344,10 @@ class CogVideoX(AdaptedBackbone):
         """Raise ``PersistError`` for an unknown sampler, bad guidance, or more steps than training has noise levels."""
         super().check_sampling(sampling)
         check_steps(sampling.steps, self.scheduler.config.num_train_timesteps)
-        adapters = [adapter.settings.noise for adapter in self.adapters.values() if isinstance(adapter, Adapter)]
-        known = max(self.settings.image_noise, *adapters, 0.0)
-        if sampling.context_noise > known:
-            raise PersistError(
-                f"context noise of {sampling.context_noise:g}; this model was trained with levels up to {known:g}, see "
-                "backbone.settings.image_noise and adapter.noise"
-            )
+
+    def known_noise(self, adapter: Path | None = None) -> float:
+        """Return the highest noise level of the given frame in training, or of the memory of an adapter."""
+        return self.settings.image_noise if adapter is None else trained_noise(adapter)
 
     @property
     def gives_depth(self) -> bool:

@@ -34,7 +34,7 @@ from persist_cli.bench.scenes.journal import SceneJournal
 from persist_cli.bench.scenes.training_houses import House, read_houses
 from persist_cli.bench.scenes.views import Region, View, near_camera, same_form, true_region
 from persist_cli.checkpoints.contamination import ALLOW, OTHER_DATA, ShownScene, known_names, refuse_training_scenes
-from persist_cli.checkpoints.load import empty_backbone
+from persist_cli.checkpoints.load import check_noise, empty_backbone
 from persist_cli.checkpoints.scene_models import TrainedSceneModel, find_scene_model
 from persist_cli.data.reference import data_folder, parse_reference
 from persist_cli.data.store import Store, TrajectoryFile
@@ -196,7 +196,9 @@ def check_samplings(plan: RenderingPlan, parts: Sequence[str]) -> None:
     backbone = empty_backbone(checkpoint)
     for part in parts:
         if part in RENDERED:
-            backbone.check_sampling(checkpoint.sampling_with(plan.sampling, RENDERED[part]))
+            sampling = checkpoint.sampling_with(plan.sampling, RENDERED[part])
+            backbone.check_sampling(sampling)
+            check_noise(sampling, [checkpoint])
 
 
 def check_model(trained: TrainedSceneModel, files: Sequence[TrajectoryFile], allowed: bool) -> None:
