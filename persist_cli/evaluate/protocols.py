@@ -294,7 +294,9 @@ class ThereAndBack(Protocol):
             poses, twice, length = found[file.path]
             if len(cases) == search.limit or len(poses) < max(frames, LEAST_RETURN_FRAMES):
                 continue
-            start = (twice - frames + 1) // 2 if length >= frames else best_start(poses, frames, search)
+            start = (twice - frames + 1) // 2
+            if length < frames or not goes_away(poses[start : start + frames]):
+                start = best_start(poses, frames, search)
             if start is not None and goes_away(poses[start : start + frames]):
                 cases.append(self.make_returning_case(file, start, frames, search))
         if not cases:
@@ -374,7 +376,7 @@ def take_turns(queues: Sequence[Sequence[T]]) -> list[T]:
 def turning_point(poses: Float[Tensor, "frame 4 4"]) -> tuple[int, int]:
     """Where a path mirrors itself the longest: twice the number of the turning frame, and frames of the mirrored part.
 
-    Twice, because a path may turn between two frames.
+    Twice, because a path may turn between two frames. Where the camera stands still nothing is mirrored.
     """
     best = (0, 0)
     for twice in range(1, 2 * len(poses) - 2):
@@ -383,7 +385,8 @@ def turning_point(poses: Float[Tensor, "frame 4 4"]) -> tuple[int, int]:
         same = same_poses(poses[first - count + 1 : first + 1].flip(0), poses[last : last + count])
         mirrored = count if bool(same.all()) else int((~same).nonzero()[0])
         length = 2 * mirrored - (1 if twice % 2 == 0 else 0)
-        if length > best[1]:
+        begin = first - mirrored + 1
+        if length > best[1] and goes_away(poses[begin : begin + length]):
             best = (twice, length)
     return best
 

@@ -124,15 +124,25 @@ def test_the_first_visit_of_a_there_and_back_is_the_frame_of_the_same_pose_once_
 
 
 def test_the_turning_point_may_lie_on_a_frame_or_between_two():
-    out = slow_turn(6)
-    assert turning_point(torch.from_numpy(np.concatenate([out, out[::-1][1:]]))) == (10, 11)
-    assert turning_point(torch.from_numpy(np.concatenate([out, out[::-1]]))) == (11, 12)
+    out = slow_turn(20)
+    assert turning_point(torch.from_numpy(np.concatenate([out, out[::-1][1:]]))) == (38, 39)
+    assert turning_point(torch.from_numpy(np.concatenate([out, out[::-1]]))) == (39, 40)
 
 
 def test_standing_still_is_no_return(tmp_path):
     Room(32, 32).write(tmp_path / "a.parquet", np.repeat(slow_turn(1), 24, axis=0))
     with pytest.raises(DataError, match="comes back"):
         PROTOCOLS["return"].find(search(tmp_path))
+
+
+@pytest.mark.parametrize("pause", [0, 24, 30])
+def test_a_return_is_found_behind_a_stretch_in_which_the_camera_stands_still(tmp_path, pause):
+    out = slow_turn(20)
+    walk = np.concatenate([np.repeat(out[:1], pause, axis=0), out, out[::-1]])
+    Room(16, 16).write(tmp_path / "a.parquet", walk)
+    (case,) = PROTOCOLS["return"].find(search(tmp_path, frames=24, new_poses=EVERY_POSE))
+    assert case.start == pause + 8
+    assert sum(visit >= 0 for visit in case.first_visits) >= 5
 
 
 def test_a_long_clip_needs_112_frames_to_predict(walks, tmp_path):
