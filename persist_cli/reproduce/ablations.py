@@ -27,7 +27,7 @@ from persist_cli.io.files import write_json, written_aside
 from persist_cli.io.hub import cached_weight
 from persist_cli.output.console import say
 from persist_cli.output.curve import Curve, draw_curves
-from persist_cli.recipe import Recipe, make_recipe, read_recipe, recipe_names
+from persist_cli.recipe import Recipe, apply_overrides, make_recipe, read_recipe, recipe_names
 from persist_cli.reproduce.commands import COLLECT, run_line, run_main
 from persist_cli.reproduce.plan_file import base_json, keep_plan, places
 
@@ -69,6 +69,10 @@ class Plan:
     clips: int = 48
     seed: int = 0
     settings: tuple[str, ...] = ()
+
+    def all_recipes(self) -> dict[str, Recipe]:
+        """The recipes by name, with the further settings."""
+        return {name: make_recipe(apply_overrides(read_recipe(name), self.settings), name) for name in self.recipes}
 
 
 @dataclass(frozen=True)
@@ -231,8 +235,7 @@ def _gain(cell: Cell, other: str) -> Gain:
 
 def points_of(plan: Plan) -> Iterator[Point]:
     """The gains that are measured so far, recipe by recipe."""
-    for name in plan.recipes:
-        recipe = make_recipe(read_recipe(name), name)
+    for name, recipe in plan.all_recipes().items():
         for samples in plan.samples:
             if (result_folder(plan, name, samples) / "metrics.json").is_file():
                 yield read_point(plan, name, recipe, samples)
@@ -300,7 +303,7 @@ def run_ablations(plan: Plan, houses: int = HOUSES) -> None:
     keep_plan(plan.out, identity(plan, houses))
     for line in preparations(plan, houses):
         run_line(line)
-    recipes = {name: make_recipe(read_recipe(name), name) for name in plan.recipes}
+    recipes = plan.all_recipes()
     missing = {name: weights for name, recipe in recipes.items() if (weights := missing_weights(recipe))}
     left_out = {name: f"persist weights fetch {weights}" for name, weights in missing.items()}
     for name, reason in left_out.items():

@@ -62,6 +62,11 @@ def test_settings_are_those_of_every_training_and_of_the_folder(monkeypatch):
     assert identity(changed, 40) == identity(PLAN, 40) | {"settings": [*changed.settings]}
 
 
+def test_another_batch_changes_the_steps_that_samples_take():
+    (recipe,) = dataclasses.replace(PLAN, recipes=(PREFIX,), settings=("training.batch=4",)).all_recipes().values()
+    assert steps_of(recipe, 4800) == 1200
+
+
 @pytest.mark.parametrize("line", LINES)
 def test_every_command_is_one_that_persist_takes(line):
     parse_line(line)
