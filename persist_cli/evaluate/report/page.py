@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,9 +30,11 @@ from persist_cli.evaluate.report.scrutiny import scrutiny, windows_tables
 from persist_cli.evaluate.report.tables import CompactTable, compact_tables
 from persist_cli.evaluate.report.templates import environment_facts, page_templates
 from persist_cli.evaluate.report.text import table_text
-from persist_cli.io.files import empty_folder_aside, remove_leftovers, write_json, write_text
+from persist_cli.io.files import empty_folder_aside, read_json, remove_leftovers, write_json, write_text
 
 PAGE = "report.html"
+
+FILES = "files.json"  # the names of all that a report wrote
 
 FOLDERS = ("clips", "curves", "sheets")
 
@@ -108,11 +109,14 @@ def _last_seen(shares: list[float | None]) -> str:
 
 
 def _move_in(aside: Path, folder: Path) -> None:
-    """Replace the files of an earlier report by the new ones, the page last."""
-    if (folder / PAGE).exists():
-        for name in FOLDERS:
-            shutil.rmtree(folder / name, ignore_errors=True)
+    """Replace the files of an earlier report by the new ones, the page last; nobody else's are touched."""
+    earlier = read_json(folder / FILES) if (folder / FILES).is_file() else []
+    for name in FOLDERS:
+        for path in (folder / name).glob("*"):
+            if f"{name}/{path.name}" in earlier:
+                path.unlink()
     files = [path for path in aside.rglob("*") if path.is_file()]
+    write_json(folder / FILES, sorted(path.relative_to(aside).as_posix() for path in files))
     for file in sorted(files, key=lambda path: path.name == PAGE):
         target = folder / file.relative_to(aside)
         target.parent.mkdir(parents=True, exist_ok=True)

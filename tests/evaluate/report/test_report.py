@@ -62,10 +62,13 @@ def test_the_page_holds_all_that_is_needed_to_measure_again(report):
 
 def test_a_new_report_replaces_the_old_one_and_leaves_other_files(tmp_path):
     write_report(example_results(), example_pictures(example_results(rows={"old": "model"})), tmp_path)
-    (tmp_path / "notes.txt").write_text("mine")
+    assert list((tmp_path / "clips").glob("*.mp4"))
+    own = [tmp_path / "notes.txt", tmp_path / "clips" / "holiday.mp4"]
+    for path in own:
+        path.write_text("mine")
     write_report(example_results(), Pictures(), tmp_path)
-    assert not list((tmp_path / "clips").glob("*"))
-    assert (tmp_path / "notes.txt").read_text() == "mine"
+    assert list((tmp_path / "clips").glob("*")) == own[1:]
+    assert [path.read_text() for path in own] == ["mine", "mine"]
 
 
 def test_a_report_that_fails_leaves_the_old_one_whole(tmp_path):
