@@ -107,7 +107,12 @@ class Journal:
         for folder in self.data():
             for name, digest in folder["trajectories"].items():
                 path = Path(folder["path"]) / f"{name}{SUFFIX}"
-                if not fetched(path).is_file() or file_sha256(path) != digest:
+                if not fetched(path).is_file():
+                    raise DataError(
+                        f"{path}: no such file, but the evaluation in {self.folder.parent} began with it; go on in the "
+                        "folder where that one was begun, or choose another --out"
+                    )
+                if file_sha256(path) != digest:
                     raise DataError(
                         f"{path}: not what it was when the evaluation in {self.folder.parent} began; choose another "
                         "--out or delete that one"

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from persist_cli import __version__
-from persist_cli.api.checkpoint import Checkpoint
+from persist_cli.api.checkpoint import WEIGHTS, Checkpoint
 from persist_cli.checkpoints import lineage
 from persist_cli.checkpoints.load import adapter_memory
 from persist_cli.data.held_out import was_trained_on
@@ -54,8 +54,9 @@ def checkpoint_json(checkpoint: Checkpoint) -> dict[str, Any]:
 
 def adapter_json(folder: Path) -> dict[str, str]:
     """The hashes of an adapter's weights and of its settings, among them the memory that it reads, as JSON values."""
-    weights, settings = file_sha256(folder / "adapter.safetensors"), files_sha256(folder, folder.glob("*.json"))
-    return {"weights": weights, "settings": settings}
+    files = list(folder.glob(f"*{WEIGHTS}"))
+    weights = file_sha256(files[0]) if len(files) == 1 else files_sha256(folder, files)
+    return {"weights": weights, "settings": files_sha256(folder, folder.glob("*.json"))}
 
 
 def scene_models(checkpoints: Sequence[Checkpoint], memories: Sequence[str]) -> list[dict[str, str]]:

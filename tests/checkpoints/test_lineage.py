@@ -118,6 +118,16 @@ def test_the_hash_of_an_adapters_settings_depends_on_its_memory(persist, stage1,
     assert after["adapter_settings"] != before["adapter_settings"]
 
 
+def test_an_adapter_may_name_its_weights_as_it_likes(stage1, voxel, tmp_path):
+    shutil.copytree(voxel, tmp_path / "stage2-voxel")
+    shutil.copytree(stage1, tmp_path / stage1.name)
+    model = find_checkpoint(tmp_path / "stage2-voxel").folder
+    (weights,) = without_sums(model).rglob("adapter.safetensors")
+    before = checkpoint_json(find_checkpoint(model))
+    weights.rename(weights.with_name("memory.safetensors"))
+    assert checkpoint_json(find_checkpoint(model)) == before
+
+
 def test_a_run_keeps_the_recipes_of_all_stages_before(persist, walks, codec, tmp_path):
     shutil.copytree(codec, tmp_path / "codec")
     for name, base in (("one", "codec"), ("two", "one")):
