@@ -20,6 +20,7 @@ WALK = ("stay", "forward", "backward", "left", "right")  # the actions that move
 STEP = 0.25  # metres of a step where nobody says another
 LONGEST_STEP = 10.0  # metres of a step that somebody gives; more are meant as millimetres, or take hours to check
 TURN = 15.0  # degrees of a turn
+MOST_ACTIONS = 1_000_000  # that one word may stand for
 WORD = re.compile(r"^(?P<name>[a-z_]+)(?:\*(?P<count>\d+))?$")
 
 
@@ -122,7 +123,10 @@ class ActionVocabulary:
                     f"write it in lower case: {word.lower()}" if lower else "write NAME or NAME*COUNT, as in left*2"
                 )
                 raise DataError(f"cannot read action {word!r}; {advice}")
-            names += [self[match["name"]].name] * int(match["count"] or 1)
+            count = int(match["count"] or 1)
+            if count > MOST_ACTIONS:
+                raise DataError(f"{word}: at most {MOST_ACTIONS:,} times; longer ways are several rollouts")
+            names += [self[match["name"]].name] * count
         if not names:
             raise DataError("no action given; write them as 'forward*4 left*2'")
         return tuple(names)

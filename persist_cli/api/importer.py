@@ -41,6 +41,9 @@ class Importer(ABC):
 
     settings_type: ClassVar[type] = NoSettings
     name: str = ""  # set by the registry
+    up: tuple[float, float, float] | None = (
+        None  # in the world of the poses, where the user says so; set before reading
+    )
 
     def __init__(self, settings: Any = None) -> None:
         self.settings = self.settings_type() if settings is None else settings

@@ -40,7 +40,13 @@ def test_writing_actions_as_text_and_parsing_them_gives_them_back():
 
 @pytest.mark.parametrize(
     ("text", "cause"),
-    [("foward*2", "did you mean 'forward'"), ("forward*x", "cannot read"), ("", "no action"), ("jump", "known: ")],
+    [
+        ("foward*2", "did you mean 'forward'"),
+        ("forward*x", "cannot read"),
+        ("", "no action"),
+        ("jump", "known: "),
+        (f"left*{10**20}", r"left\*10+: at most 1,000,000 times"),
+    ],
 )
 def test_unknown_actions_are_refused(text, cause):
     with pytest.raises(DataError, match=cause) as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import math
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -17,10 +18,10 @@ from scipy.spatial.transform import Rotation
 
 from persist_cli.api.actions import FREE, free_motion
 from persist_cli.api.cameras import check_intrinsics, check_pose
-from persist_cli.api.importer import ForeignTrajectory
+from persist_cli.api.importer import ForeignTrajectory, Importer
 from persist_cli.api.observations import Frame, TrajectoryInfo
 from persist_cli.data.importers.checking import FIT_NAME, is_fit_name
-from persist_cli.data.importers.gravity import FROM_CAMERAS, FROM_SURFACES, Direction, estimate_up, level_up
+from persist_cli.data.importers.gravity import FROM_CAMERAS, FROM_SURFACES, GIVEN, Direction, estimate_up, level_up
 from persist_cli.data.importers.lenses import Array, Lens, Size, retake, undistort
 from persist_cli.data.importers.readers import StoredImage, read_matrix
 from persist_cli.data.importers.turning import QuarterTurns
@@ -144,6 +145,9 @@ class Capture:
             if isinstance(frame.pose, DataError):
                 yield frame.pose
                 continue
+            if not math.isfinite(frame.seconds):
+                yield DataError(f"{frame.color}: its time is {frame.seconds}, not a finite number of seconds")
+                continue
             try:
                 rgb, depth = (turns.image(image) for image in self._images(frame, lens, size))
             except DataError as error:
@@ -222,6 +226,11 @@ def world_up_of(captures: Sequence[Capture]) -> tuple[Direction, str]:
             views.append((depth, np.asarray(frame.pose), lens.matrix))
     level = level_up(up, views)
     return (up, FROM_CAMERAS) if level is None else (level, FROM_SURFACES)
+
+
+def given_up(importer: Importer) -> tuple[Direction, str] | None:
+    """The direction up that the user gave, and that it was given; ``None`` where the importer has to know it."""
+    return None if importer.up is None else (importer.up, GIVEN)
 
 
 def lens_of(stored: StoredImage, lens: Lens, image: Array) -> Lens:

@@ -93,7 +93,7 @@ class ImportPlan:
     def info(self, info: TrajectoryInfo) -> TrajectoryInfo:
         """The info of the imported trajectory."""
         info = replace(info, vocabulary=self._vocabulary(info.vocabulary))
-        if self.up is not None:
+        if self.up is not None and not str(info.source.get("world_up", "")).startswith(GIVEN):
             info = replace(info, world_up=self.up, source={**info.source, "world_up": GIVEN})
         if self.every > 1:
             info = replace(info, source={**info.source, "every": self.every})
@@ -199,6 +199,7 @@ def run_import(
             settings in ``out``.
     """
     importer = make_importer(format, dict(settings or {}))
+    importer.up = plan.up
     check_folder(out)
     if not source.exists():
         raise DataError(f"{source}: no such file or folder")

@@ -20,7 +20,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from persist_cli.api.importer import ForeignTrajectory, Importer
-from persist_cli.data.importers.captures import Capture, CapturedFrame, folders_with, world_up_of
+from persist_cli.data.importers.captures import Capture, CapturedFrame, folders_with, given_up, world_up_of
 from persist_cli.data.importers.lerobot_images import Images, VideoImages, choose_images, image_features
 from persist_cli.data.importers.lerobot_info import ROBOT, LeRobotSettings, PoseFeature, read_info
 from persist_cli.data.importers.readers import INTRINSICS, StoredImage, check_file, read_lens
@@ -58,7 +58,7 @@ class LeRobot(Importer):
     def _of_dataset(self, folder: Path) -> Iterator[ForeignTrajectory | DataError]:
         """Read every episode of a dataset."""
         captures: Iterable[Capture | DataError] = Dataset(folder, self.settings).captures()
-        up = UP_OF_ROBOTS if self.settings.axes == ROBOT else None
+        up = given_up(self) or (UP_OF_ROBOTS if self.settings.axes == ROBOT else None)
         if up is None and self.settings.scene != "episode":
             captures = list(captures)
             usable = [capture for capture in captures if isinstance(capture, Capture)]

@@ -23,6 +23,7 @@ from persist_cli.data.importers.captures import (
     checked_pose,
     each_or_cause,
     folders_with,
+    given_up,
     numbered,
 )
 from persist_cli.data.importers.lenses import Array, Lens
@@ -49,7 +50,7 @@ class Nerfstudio(Importer):
         else:
             folders = folders_with(TRANSFORMS, source, f"{TRANSFORMS} in it nor folders with one")
             files = [folder / TRANSFORMS for folder in folders]
-        return each_or_cause(files, lambda file: read_transforms(file).trajectory(Z_UP))
+        return each_or_cause(files, lambda file: read_transforms(file).trajectory(given_up(self) or Z_UP))
 
 
 def read_transforms(file: Path) -> Capture:
@@ -99,7 +100,7 @@ def _lens(values: Mapping[str, Any], file: Path) -> Lens:
         k4 = float(values.get("k4", 0.0))
     except KeyError as error:
         raise DataError(f"{file}: no {error.args[0]}; it must have fl_x, fl_y, cx, cy, w and h") from error
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise DataError(f"{file}: its intrinsics are not numbers ({error})") from error
     if k4 or not np.isfinite([fx, fy, cx, cy, k1, k2, p1, p2, k3]).all() or min(fx, fy, height, width) <= 0:
         raise DataError(f"{file}: its intrinsics are none of OpenCV's pinhole camera with k1, k2, p1, p2 and k3")

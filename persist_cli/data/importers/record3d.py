@@ -28,6 +28,7 @@ from persist_cli.data.importers.captures import (
     Capture,
     CapturedFrame,
     each_or_cause,
+    given_up,
     quaternion_pose,
     world_up_of,
 )
@@ -61,7 +62,7 @@ class Record3D(Importer):
 
         def trajectory(file: Path) -> ForeignTrajectory:
             capture = read_recording(file, unpack)
-            return capture.trajectory(world_up_of([capture]))
+            return capture.trajectory(given_up(self) or world_up_of([capture]))
 
         return each_or_cause(files, trajectory)
 
@@ -147,7 +148,7 @@ def read_recording(path: Path, unpack: Callable[[bytes], bytes]) -> Capture:
         seconds = _seconds(values)
     except KeyError as error:
         raise DataError(f"{where}: no {error.args[0]}") from error
-    except (TypeError, ValueError, IndexError) as error:
+    except (TypeError, ValueError, IndexError, OverflowError) as error:
         raise DataError(f"{where}: its camera or its times are not numbers ({error})") from error
     frames = [
         CapturedFrame(

@@ -20,6 +20,7 @@ from persist_cli.data.importers.captures import (
     CapturedFrame,
     each_or_cause,
     folders_with,
+    given_up,
     numbered,
     read_pose,
 )
@@ -44,7 +45,7 @@ class ScanNet(Importer):
             DataError: when there is none.
         """
         folders = folders_with("pose", source, "color, depth and pose folders in it nor scans that have them")
-        return each_or_cause(folders, lambda folder: read_scan(folder).trajectory(Z_UP))
+        return each_or_cause(folders, lambda folder: read_scan(folder).trajectory(given_up(self) or Z_UP))
 
 
 def read_scan(folder: Path) -> Capture:

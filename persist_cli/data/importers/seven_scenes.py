@@ -14,8 +14,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from persist_cli.api.importer import ForeignTrajectory, Importer
-from persist_cli.data.importers.captures import Capture, CapturedFrame, each_or_cause, numbered, read_pose, world_up_of
-from persist_cli.data.importers.gravity import Direction
+from persist_cli.data.importers.captures import (
+    Capture,
+    CapturedFrame,
+    each_or_cause,
+    given_up,
+    numbered,
+    read_pose,
+    world_up_of,
+)
 from persist_cli.data.importers.lenses import Lens
 from persist_cli.data.importers.readers import INTRINSICS, color_file, depth_file, read_lens
 from persist_cli.errors import DataError
@@ -41,7 +48,7 @@ class SevenScenes(Importer):
         folders = [source] if any(source.glob("frame-*")) else _sequence_folders(source)
         if not folders:
             raise DataError(f"{source}: neither frame-*.color files nor seq-* folders in it")
-        up: tuple[Direction, str] | None = None
+        up = given_up(self)
 
         def trajectory(folder: Path) -> ForeignTrajectory:
             nonlocal up

@@ -24,6 +24,7 @@ from persist_cli.data.importers.captures import (
     CapturedFrame,
     each_or_cause,
     folders_with,
+    given_up,
     quaternion_pose,
 )
 from persist_cli.data.importers.lenses import Array, Lens
@@ -48,7 +49,7 @@ class StrayScanner(Importer):
             DataError: when there is none.
         """
         folders = folders_with(ODOMETRY, source, f"{ODOMETRY} in it nor folders with one")
-        return each_or_cause(folders, lambda folder: read_scan(folder).trajectory(Y_UP))
+        return each_or_cause(folders, lambda folder: read_scan(folder).trajectory(given_up(self) or Y_UP))
 
 
 def read_scan(folder: Path) -> Capture:

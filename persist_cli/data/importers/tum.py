@@ -21,7 +21,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from persist_cli.api.importer import ForeignTrajectory, Importer
-from persist_cli.data.importers.captures import Z_UP, Capture, CapturedFrame, each_or_cause, folders_with
+from persist_cli.data.importers.captures import Z_UP, Capture, CapturedFrame, each_or_cause, folders_with, given_up
 from persist_cli.data.importers.lenses import Array, Lens
 from persist_cli.data.importers.readers import INTRINSICS, color_file, depth_file, read_lens
 from persist_cli.errors import DataError
@@ -62,7 +62,7 @@ class TumRgbd(Importer):
             DataError: when there is none.
         """
         folders = folders_with(LISTS[0], source, f"{', '.join(LISTS)} in it nor folders with them")
-        return each_or_cause(folders, lambda folder: read_recording(folder).trajectory(Z_UP))
+        return each_or_cause(folders, lambda folder: read_recording(folder).trajectory(given_up(self) or Z_UP))
 
 
 def read_recording(folder: Path) -> Capture:

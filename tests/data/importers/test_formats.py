@@ -245,6 +245,7 @@ def set_first(**changes: Any) -> Callable[[dict[str, Any]], None]:
         (set_values(camera_model="OPENCV_FISHEYE"), "a OPENCV_FISHEYE camera; undistort the images"),
         (set_values(k4=0.1), "its intrinsics are none of OpenCV's pinhole camera"),
         (set_values(fl_x="wide"), "its intrinsics are not numbers"),
+        (set_values(h=float("inf")), "its intrinsics are not numbers"),
         (lambda values: values.pop("cx"), "no cx; it must have fl_x, fl_y, cx, cy, w and h"),
         (lambda values: [frame.pop("depth_file_path") for frame in values["frames"]], "no frame has depth_file_path"),
         (set_values(w=96), "48×64 pixels, its camera is of 96×96, which is another aspect"),

@@ -90,6 +90,21 @@ def test_an_imported_scan_can_be_inspected(persist: Any, tmp_path: Path) -> None
     assert "images turned by 90°" in inspected.out
 
 
+def test_images_are_upright_by_the_axis_that_is_given_not_by_that_of_the_format(persist: Any, tmp_path: Path) -> None:
+    scan = write_stray(tmp_path / "room")
+    imported = persist("import", "stray", scan, "--out", tmp_path / "out", "--up", "0,-1,0")
+    assert imported.code == 0, imported.err
+    (file,) = Store(tmp_path / "out")
+    assert file.info.world_up == (0, -1, 0)
+    assert file.info.source["world_up"] == "given; images turned by 180°"
+    truth = list(ROOM.frames(walk(24)[:4]))
+    seen = file.read(slice(0, 4)).observations
+    assert np.array_equal(seen.rgb[2].numpy(), np.rot90(truth[2].rgb, 2))
+    assert seen.cameras.world_from_camera[2, :3, 1].numpy() == pytest.approx(-walk(24)[2][:3, 1], abs=1e-6)
+    inspected = persist("inspect", tmp_path / "out")
+    assert (inspected.code, "agree" in inspected.out) == (0, True), inspected.out
+
+
 def test_a_folder_of_scans_is_as_many_scenes(tmp_path: Path) -> None:
     scan = write_stray(tmp_path / "all/a", 2)
     shutil.copytree(scan, tmp_path / "all/b")
@@ -118,6 +133,7 @@ def cut_video(scan: Path) -> None:
         (cut_video, "rgb.mp4: the video ends after 2 frames, there is no frame 2"),
         (lambda scan: change_line(scan, 3, "1, 2, 0, 0, 0, 0, 0, 0, 0"), "odometry.csv: frame 2 is no pose"),
         (lambda scan: change_line(scan, 3, "1, 2, 0, nan, 0, 0, 0, 0, 1"), "odometry.csv: frame 2: the pose is not"),
+        (lambda scan: change_line(scan, 3, "nan, 2, 0, 0, 0, 0, 0, 0, 1"), "frame 2: its time is nan, not a finite"),
     ],
 )  # fmt: skip
 def test_a_frame_of_a_scan_that_cannot_be_used_is_named_or_left_out(
@@ -274,6 +290,7 @@ def changed(**values: Any) -> Callable[[Path], None]:
         (changed(K=[1.0], perFrameIntrinsicCoeffs=None), "metadata: its camera or its times are not numbers"),
         (changed(perFrameIntrinsicCoeffs=[[0, 1, 2, 3]] * 4), "focal lengths and sizes must be above 0"),
         (changed(frameTimestamps=["soon"] * 4), "metadata: its camera or its times are not numbers"),
+        (changed(h=float("inf")), "metadata: its camera or its times are not numbers"),
         (changed(poses=[[0, 0, 0, 1, 0, 0]] * 4), "pose 0 is not qx, qy, qz, qw, x, y, z"),
     ],
 )

@@ -89,10 +89,10 @@ def test_the_up_axis_can_be_given_and_is_shown(persist, sequence: Path, tmp_path
     result = persist("import", "7scenes", sequence, "--out", tmp_path / "out", "--up", "-1,0,0")
     assert (result.code, "-1.00, 0.00, 0.00" in result.out) == (0, True)
     info = Store(tmp_path / "out")[0].info
-    assert (info.world_up, info.source["world_up"]) == ((-1.0, 0.0, 0.0), "given")
+    assert (info.world_up, info.source["world_up"]) == ((-1.0, 0.0, 0.0), "given; images turned by 270°")
     shown = persist("inspect", tmp_path / "out", "--pairs", 1).out
     assert re.search(r"up axis +│ +-1\.00, 0\.00, 0\.00 ", shown)
-    assert re.search(r"up axis is +│ +given ", shown)
+    assert re.search(r"up axis is +│ +given; images turned", shown)
     again = persist("import", "7scenes", sequence, "--out", tmp_path / "out")
     assert (again.code, "of other settings" in again.err) == (1, True)
 
