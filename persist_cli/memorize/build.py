@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,11 @@ from persist_cli.api.memory import Memory
 from persist_cli.api.scene import Scene
 from persist_cli.errors import CheckpointError, DataError, FrameError, PersistError
 from persist_cli.io.command_line import quoted
-from persist_cli.io.files import check_folder, remove_leftovers
+from persist_cli.io.files import check_folder, empty_folder_aside, remove_leftovers
 from persist_cli.memorize.imagining import of_known_cells, with_scene_model
-from persist_cli.memorize.memory_config import MemorizePlan, resolve_memory_config, with_usual_classes
+from persist_cli.memorize.memory_config import MemorizePlan, reading_adapter, resolve_memory_config, with_usual_classes
 from persist_cli.memorize.memory_file import add_paths, load_memory, load_paths
-from persist_cli.memorize.picture import PictureOptions, is_picture, refuse_picture_options, write_picture
+from persist_cli.memorize.picture import PictureOptions, is_picture, refuse_picture_options, take_place, write_picture
 from persist_cli.memorize.sources import Source, common_reference, find_sources
 from persist_cli.output.console import add_task, busy, print_json, print_table, progress, say, warn, watched
 from persist_cli.output.map import draw_map
@@ -43,8 +44,25 @@ def run_memorize(data: list[str], plan: MemorizePlan, picture: PictureOptions, o
     """
     _check_out(out)
     config, origin = resolve_memory_config(plan)
-    check_imagines(config, plan)  # before a picture is written, which replaces others beside the memory
-    sources = find_sources(_with_picture(data, picture, out))
+    check_imagines(config, plan)
+    with _with_picture(data, picture, out) as references:
+        sources = find_sources(references)
+        memory, extra = _built(sources, config, plan, origin)
+        map_file = out.with_suffix(".png")
+        if is_picture(data[0]):
+            given = [Path(data[0]), *([] if picture.depth is None else [picture.depth])]
+            if map_file.exists() and any(map_file.samefile(path) for path in given):
+                map_file = out.with_suffix(".map.png")  # neither is replaced by the map of the scene
+            extra["start"] = f"{_frame_folder(out)}#{sources[0].file.name}:0"
+        _save_and_print(memory, _paths(sources), (out, map_file), json, extra)
+    if "start" in extra and not json:
+        say(walking_words(memory.name, out, str(extra["start"]), plan.checkpoint))
+
+
+def _built(
+    sources: Sequence[Source], config: MemoryConfig, plan: MemorizePlan, origin: str | None
+) -> tuple[Memory, dict[str, Any]]:
+    """The memory of the sources, and what is said of it beside its size."""
     asked = origin is None or plan.checkpoint is not None
     config = with_usual_classes(of_known_cells(config, sources[0].file, asked))
     with busy("loading the encoder"):
@@ -53,38 +71,50 @@ def run_memorize(data: list[str], plan: MemorizePlan, picture: PictureOptions, o
     scene = imagining_scene(memory) if plan.complete else None
     seconds = write_sources(memory, sources)
     frames = sum(len(source.frames) for source in sources)
-    paths: dict[str, Tensor] = {}
-    for source in sources:
-        walked = source.file.poses()[source.frames.start : source.frames.stop]
-        add_paths(paths, {source.file.name: walked})
     extra = {"frames": frames, "frames_per_second": frames / seconds, "settings_of": origin}
     if scene is not None:
-        _check_floor(scene, config, walked[-1])  # the newest camera
+        newest = sources[-1]
+        _check_floor(scene, config, newest.file.poses()[newest.frames.stop - 1])
         began = time.perf_counter()
         with busy("imagining"):
             seed = config.settings.get("seed", 0) if plan.seed is None else plan.seed
             extra["completed"] = scene.complete(seed=seed)
         extra["seconds_imagining"] = time.perf_counter() - began
-    map_file = out.with_suffix(".png")
-    if is_picture(data[0]):
-        given = [Path(data[0]), *([] if picture.depth is None else [picture.depth])]
-        if map_file.exists() and any(map_file.samefile(path) for path in given):
-            map_file = out.with_suffix(".map.png")  # neither is replaced by the map of the scene
-        extra["start"] = f"{sources[0].file.path.parent}#{sources[0].file.name}:0"
-    _save_and_print(memory, paths, (out, map_file), json, extra)
-    if "start" in extra and not json:
-        say(walking_words(memory, out, str(extra["start"]), plan.checkpoint))
+    return memory, extra
 
 
-def _with_picture(data: list[str], options: PictureOptions, out: Path) -> list[str]:
-    """References to data; a picture is written as a data set beside the memory first."""
+def _paths(sources: Sequence[Source]) -> dict[str, Tensor]:
+    """The poses of all frames that were written, by trajectory."""
+    paths: dict[str, Tensor] = {}
+    for source in sources:
+        add_paths(paths, {source.file.name: source.file.poses()[source.frames.start : source.frames.stop]})
+    return paths
+
+
+@contextlib.contextmanager
+def _with_picture(data: list[str], options: PictureOptions, out: Path) -> Iterator[list[str]]:
+    """References to data; a picture is written as a data set, which is put beside the memory when the block ends well.
+
+    Other pictures that are there are removed then, since frame 0 of the folder is where a walk starts.
+    """
     pictures = [text for text in data if is_picture(text)]
     if not pictures:
         refuse_picture_options(options)
-        return data
+        yield data
+        return
     if len(data) > 1:
         raise DataError(f"{pictures[0]}: a scene of a picture is made of one picture, here are {len(data)}")
-    return [str(write_picture(Path(pictures[0]), options, out.with_suffix(".frame")))]
+    folder = _frame_folder(out)
+    remove_leftovers(folder.parent, folder.name)
+    with empty_folder_aside(folder) as aside:
+        written = write_picture(Path(pictures[0]), options, aside)
+        yield [str(aside)]
+        take_place(written, folder)
+
+
+def _frame_folder(out: Path) -> Path:
+    """Where the data set of a memory's picture is."""
+    return out.with_suffix(".frame")
 
 
 def check_imagines(config: MemoryConfig, plan: MemorizePlan) -> None:
@@ -209,10 +239,14 @@ def _save_and_print(
         say(f"memory: {out}\nmap: {map_file}")
 
 
-def walking_words(memory: Memory, out: Path, start: str, checkpoint: Path | None) -> str:
+def walking_words(memory: str, out: Path, start: str, checkpoint: Path | None) -> str:
     """Return the command that walks in the memory of a picture, by default with the packaged world model."""
+    adapter = reading_adapter(checkpoint, memory)
+    if adapter is None:
+        name = "the packaged model" if checkpoint is None else str(checkpoint)
+        return f"to walk in it, train an adapter that reads a memory {memory!r}: {name} has none"
     model = [] if checkpoint is None else [str(checkpoint)]
-    walk = " ".join(map(quoted, [*model, "--adapter", memory.name, "--start", start, "--memory", str(out)]))
+    walk = " ".join(map(quoted, [*model, "--adapter", adapter, "--start", start, "--memory", str(out)]))
     return f'walk in it: persist rollout {walk} --actions "right*6"'
 
 

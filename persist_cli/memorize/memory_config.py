@@ -136,6 +136,15 @@ def adapter_of(checkpoint: Checkpoint, memory: str | None) -> tuple[MemoryConfig
     return adapter_memory(checkpoint, adapter), f"adapter {adapter!r} of {checkpoint.folder}"
 
 
+def reading_adapter(checkpoint: Path | None, memory: str) -> str | None:
+    """The adapter that reads a memory of this name, of a checkpoint or else of the packaged one, where it has one."""
+    found = _find_reference_checkpoint() if checkpoint is None else find_checkpoint(checkpoint)
+    if found is None:
+        return None
+    readers = [adapter for adapter, name in _memory_names(found).items() if name == memory]
+    return memory if memory in readers else next(iter(readers), None)
+
+
 def _memory_names(checkpoint: Checkpoint) -> dict[str, str]:
     """Return for each adapter the name of the memory that it reads."""
     return {name: adapter_memory(checkpoint, name).name for name in checkpoint.adapters}

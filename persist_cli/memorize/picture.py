@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 import zipfile
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
 UP = (0.0, 1.0, 0.0)
 FIELD_OF_VIEW = 75.0  # degrees from the top to the bottom of the image, as ``persist collect`` has it
 HEIGHT = Body().camera_height
+FORMAT = "picture"  # what the source of such a data set says of it
 Array = np.ndarray[Any, Any]
 
 
@@ -56,9 +58,7 @@ def is_picture(text: str) -> bool:
 
 
 def write_picture(picture: Path, options: PictureOptions, folder: Path) -> Path:
-    """Write a data set of one frame, seen by a level camera 1.25 m above the world's origin, and return its folder.
-
-    Other pictures that were written there are removed, since frame 0 of the folder is where a walk starts.
+    """Write a data set of one frame, seen by a level camera 1.25 m above the world's origin, and return its file.
 
     Raises:
         DataError: one line, when picture or depth cannot be read, do not fit, or there is no depth.
@@ -78,16 +78,22 @@ def write_picture(picture: Path, options: PictureOptions, folder: Path) -> Path:
         fit = crop_resize((height, width), (options.size, options.size))
         rgb, depth, matrix = fit.rgb(rgb), fit.depth(depth), fit.intrinsics(matrix)
         height = width = options.size
-    source = {"format": "picture", "picture": picture.name, "camera_height": HEIGHT}
+    source = {"format": FORMAT, "picture": picture.name, "camera_height": HEIGHT}
     info = TrajectoryInfo(f"picture/{picture.stem}", matrix, height, width, UP, walking_actions(), source)
     pose = np.diag([1.0, -1.0, -1.0, 1.0])  # level, towards -z
     pose[1, 3] = HEIGHT
     written = folder / f"{re.sub('[#:]', '-', picture.stem)}{SUFFIX}"  # a reference to frames has these signs
     write_trajectory(written, info, [Frame(rgb, depth, pose)])
+    return written
+
+
+def take_place(written: Path, folder: Path) -> None:
+    """Move the file of a picture into a folder, in the place of all other pictures there."""
+    folder.mkdir(parents=True, exist_ok=True)
+    os.replace(written, folder / written.name)
     for other in Store(folder):
-        if other.path != written and other.info.source.get("format") == source["format"]:
+        if other.name != written.stem and other.info.source.get("format") == FORMAT:
             other.path.unlink()
-    return folder
 
 
 def read_depth(path: Path) -> Array:

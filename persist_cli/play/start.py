@@ -83,7 +83,7 @@ def _picture_start(options: StartOptions, image_size: tuple[int, int]) -> Trajec
         raise DataError(f"--start {picture}: the model takes {height}x{width}, and pictures are made square; give data")
     with tempfile.TemporaryDirectory() as folder:
         sized = replace(options.picture, size=height)
-        start = Store(write_picture(picture, sized, Path(folder)))[0].read()
+        start = Store(write_picture(picture, sized, Path(folder)).parent)[0].read()
     return _with_steps(start, options)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -134,15 +133,32 @@ def test_a_second_picture_takes_the_place_of_the_first_one(hall, tmp_path, capsy
     assert [path.name for path in (tmp_path / "scene.frame").iterdir()] == ["hall.parquet"]
 
 
-def test_the_command_that_walks_in_a_picture_is_printed(hall, tmp_path, capsys):
+def test_the_command_that_walks_in_a_picture_is_printed(hall, tmp_path, capsys, monkeypatch):
+    monkeypatch.delenv("PERSIST_REFERENCE")
     out = tmp_path / "hall.safetensors"
     succeed(hall / "hall.png", "--memory", "scene", "--depth", hall / "hall.npy", "--out", out)
     text = " ".join(capsys.readouterr().out.split())
     assert f"walk in it: persist rollout --adapter scene --start {tmp_path}/hall.frame#hall:0 --memory {out}" in text
-    words = walking_words(load_memory(out), out, "hall.frame#hall:0", Path("runs/mine"))
-    assert words.startswith("walk in it: persist rollout runs/mine --adapter scene --start hall.frame#hall:0")
-    words = walking_words(load_memory(out), out, "hall.frame#My Hall:0", None)
+    words = walking_words("scene", out, "hall.frame#My Hall:0", None)
     assert " --start 'hall.frame#My Hall:0' --memory " in words
+
+
+def test_the_command_that_walks_in_a_picture_names_an_adapter_that_there_is(voxel, tmp_path, monkeypatch):
+    monkeypatch.delenv("PERSIST_REFERENCE")
+    assert walking_words("points", tmp_path / "a", "a.frame#a:0", None).startswith("to walk in it, train an adapter")
+    words = walking_words("voxel", tmp_path / "a", "a.frame#a:0", voxel)
+    assert words.startswith(f"walk in it: persist rollout {voxel} --adapter voxel --start")
+
+
+@pytest.mark.parametrize("wrong", [("--set", "memory.size=-1"), ("--model", "nowhere", "--complete")])
+def test_what_fails_leaves_the_picture_of_the_scene_that_is_there(hall, persist, tmp_path, wrong):
+    out, other = tmp_path / "scene.safetensors", tmp_path / "other.png"
+    other.write_bytes((hall / "hall.png").read_bytes())
+    options = ("--depth", hall / "hall.npy", "--memory", "scene", "--out", out)
+    assert persist("memorize", hall / "hall.png", *options).code == 0
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    assert persist("memorize", other, *options, *wrong).code == 1
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
 def test_a_walk_can_start_at_a_picture_whose_name_has_the_signs_of_a_reference(hall, tmp_path, capsys):
