@@ -73,6 +73,8 @@ class MapPoints:
         spread: side in metres of the square that is drawn for each point.
         origins: the ``Origin`` of each point, or its ``CellOrigin``; without it all are observed.
         rise: metres of height that each point stands for, half of them below it; infinite where heights are unknown.
+        edges: for points that are middles of cells, the three edges of a cell as rows, world metres; that of its height
+            is zero where heights are unknown.
     """
 
     positions: Float[Tensor, "point 3"]
@@ -80,6 +82,7 @@ class MapPoints:
     spread: float = 0.05
     origins: UInt8[Tensor, " point"] = None  # type: ignore[assignment]  # set below
     rise: float = 0.0
+    edges: Float[Tensor, "3 3"] | None = None
 
     def __post_init__(self) -> None:
         if self.origins is None:

@@ -32,15 +32,15 @@ GOLDEN: Final = 0.618034  # turns of hue from class to class, so that neighbouri
 
 @dataclass(frozen=True)
 class DrawnCells:
-    """Blocks of equal size, aligned with the ground.
+    """Blocks of equal size, upright or nearly so.
 
     Args:
         centers: ``[cell, 3]`` float64, world metres.
         colors: ``[cell, 3]`` uint8 RGB, 0…255.
         origins: ``[cell]`` uint8, the ``CellOrigin`` of each.
         kinds: ``[cell]`` uint8, index into the palette; ``NO_CLASS`` where none is known.
-        size: metres along the two ground axes and up.
-        axes: ``[3, 3]`` float64, rows are the two ground axes and up.
+        size: metres along the axes.
+        axes: ``[3, 3]`` float64 rotation, rows are the axes of the blocks; the last one is up, or nearest to it.
         palette: names of the classes; empty where there are none.
     """
 
@@ -61,7 +61,7 @@ class DrawnCells:
 
     @property
     def local(self) -> Array:
-        """The centres along the two ground axes and up, metres."""
+        """The centres along the axes, metres."""
         return self.centers @ self.axes.T
 
     @property
@@ -89,16 +89,37 @@ def cells_of_grid(grid: CellGrid) -> DrawnCells:
 
 def cells_of_points(points: MapPoints, world_up: tuple[float, float, float]) -> DrawnCells:
     """Return the points of a memory as blocks; one without a height of its own is as high as it is wide."""
-    rise = points.rise if math.isfinite(points.rise) and points.rise > 0 else points.spread
+    axes, size = _form_of(points, world_up)
     colors, origins = points.colors.cpu().numpy(), points.origins.cpu().numpy()
     return DrawnCells(
         points.positions.cpu().double().numpy(),
         colors,
         origins,
         np.full(len(colors), NO_CLASS, np.uint8),
-        (points.spread, points.spread, rise),
-        ground_axes(world_up).numpy(),
+        size,
+        axes,
     )
+
+
+def _form_of(points: MapPoints, world_up: tuple[float, float, float]) -> tuple[Array, tuple[float, float, float]]:
+    """Return axes and size of the blocks of a memory's points: of its cells, which need not be level."""
+    rise = points.rise if math.isfinite(points.rise) and points.rise > 0 else points.spread
+    axes = ground_axes(world_up).numpy()
+    if points.edges is None:
+        return axes, (points.spread, points.spread, rise)
+    edges = points.edges.cpu().numpy()
+    sizes = np.linalg.norm(edges, axis=1)
+    flat = sizes == 0
+    edges = np.where(flat[:, None], axes[2], edges / np.where(flat, 1.0, sizes)[:, None])
+    sizes = np.where(flat, rise, sizes)
+    tops = edges @ axes[2]
+    third = int(np.abs(tops).argmax())
+    first, second = (number for number in range(3) if number != third)
+    edges[third] *= np.sign(tops[third])
+    edges[second] *= np.sign(np.cross(edges[first], edges[second]) @ edges[third])  # a rotation, no reflection
+    order = [first, second, third]
+    width, depth, height = sizes[order].tolist()
+    return edges[order], (width, depth, height)
 
 
 def cells_of_frames(seen: Observations, world_up: tuple[float, float, float]) -> DrawnCells:

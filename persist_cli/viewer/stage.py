@@ -81,16 +81,21 @@ class Stage:
 
     def bounds(self) -> tuple[Array, Array]:
         """Return the lowest and highest coordinates of all that is drawn along the ground axes and up, metres."""
-        places = [cells.local for cells in self.layers.values() if len(cells)]
+        places = [cells.centers @ self.axes.T for cells in self.layers.values() if len(cells)]
         places += [walk.cameras.centers.double().numpy() @ self.axes.T for walk in self.subject.walks]
         if not places:
             return np.full(3, -1.0), np.full(3, 1.0)
         return np.min([part.min(axis=0) for part in places], axis=0), np.max([p.max(axis=0) for p in places], axis=0)
 
     def default_cut(self) -> float:
-        """Return the height just above the highest camera, where a ceiling is cut away; infinite without a camera."""
+        """Return the height just above the highest camera, where a ceiling is cut away.
+
+        It is infinite without a camera, or where a layer has nothing below it, as a flat map of unknown height may.
+        """
         heights = [walk.cameras.centers.double().numpy() @ self.axes[2] for walk in self.subject.walks]
-        return float(max(part.max() for part in heights)) + ABOVE_CAMERA if heights else math.inf
+        cut = float(max(part.max() for part in heights)) + ABOVE_CAMERA if heights else math.inf
+        lowest = [float(self.heights(cells).min()) for cells in self.layers.values() if len(cells)]
+        return cut if all(low <= cut for low in lowest) else math.inf
 
     def truth_offset(self) -> tuple[float, float, float]:
         """Return by how many metres the truth stands beside the rest."""
@@ -134,8 +139,13 @@ class Stage:
 
     def shown(self, cells: DrawnCells) -> Array:
         """Return which blocks lie below the cut."""
-        below: Array = cells.local[:, 2] <= self.look.cut
+        below: Array = self.heights(cells) <= self.look.cut
         return below
+
+    def heights(self, cells: DrawnCells) -> Array:
+        """Return how high the middles of blocks lie along up, metres."""
+        heights: Array = cells.centers @ self.axes[2]
+        return heights
 
     def set_changes(self, before: DrawnCells, after: DrawnCells) -> None:
         """Let the map be grey, with what an edit changed in one colour and what it took away in another."""

@@ -200,7 +200,9 @@ class GridMemory(Memory):
         """Return the cells' centres, in the colours of their nearest observations."""
         centers = self._in_world(self._centers(self.grid.keys))
         colors, origins = unpack_colors(self.grid.values("colors")), self.grid.values(ORIGINS)
-        return MapPoints(centers, colors, self.lattice.across, origins, self.lattice.rise(self.reference.world_up))
+        rise = self.lattice.rise(self.reference.world_up)
+        edges = self.lattice.extent[:, None] * self.lattice.grid_from_world
+        return MapPoints(centers, colors, self.lattice.across, origins, rise, edges)
 
     def figures(self) -> MemoryFigures:
         """Return the number of cells, their bytes, and the corners of the smallest world-aligned box around them."""
