@@ -38,8 +38,9 @@ class Paint(_Edit):
 class Insert(_Edit):
     """Put a thing of a class at a place: a box of cells whose lowest face has its middle there.
 
-    Where a coordinate is ``None``, which only the height may be, it stands on what is there already. Without a size or
-    colour it gets that of the scene's own things of this class, or a usual one.
+    Where a coordinate is ``None``, which only the height may be, it stands on what is there already. Its size is given
+    along the world's axes; in a world that is not upright each axis of the cells takes that of the nearest one. Without
+    a size or colour it gets that of the scene's own things of this class, or a usual one.
     """
 
     edit: Literal["insert"] = "insert"

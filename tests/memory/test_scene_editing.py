@@ -1,5 +1,8 @@
 """Edits of cells by hand leave no hole, and change nothing but what they are asked to."""
 
+import dataclasses
+import math
+
 import pytest
 import torch
 
@@ -260,6 +263,19 @@ def test_an_inserted_thing_stands_at_the_height_and_has_the_size_and_colour_that
     assert size == pytest.approx([0.5, 0.25, 0.75])
     assert new.box.low[1] == pytest.approx(1.125)
     assert new.color == (9, 8, 7)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 27.0, 44.0])
+def test_an_inserted_thing_is_as_large_in_a_world_that_is_not_upright(degrees):
+    grid = cell_room()
+    turn = math.radians(degrees)
+    about_x = torch.tensor([[1, 0, 0], [0, math.cos(turn), -math.sin(turn)], [0, math.sin(turn), math.cos(turn)]])
+    tilted = dataclasses.replace(grid, axes=grid.axes @ about_x.double().T)
+    at = tuple((about_x.double() @ torch.tensor([2.0, 1.0, 1.0], dtype=torch.float64)).tolist())
+    room = edited(tilted, Insert(kind="box", at=at, size=(0.5, 0.25, 0.75)))
+    new = max((thing for thing in find_things(room) if thing.kind == "box"), key=lambda thing: int(thing.cells[0, 2]))
+    cells = new.cells.amax(0) - new.cells.amin(0) + 1
+    assert (cells * grid.form.size).tolist() == pytest.approx([0.5, 0.75, 0.25])
 
 
 @pytest.mark.parametrize(

@@ -273,7 +273,7 @@ def _usual(grid: CellGrid, edit: Insert) -> tuple[Float[Tensor, " 3"], tuple[int
     own = [thing for thing in find_things(grid) if thing.kind == edit.kind]
     extent = torch.tensor(SIZES.get(edit.kind, SIZE), dtype=torch.float64)
     if edit.size is not None:
-        extent = (grid.axes @ torch.tensor(edit.size, dtype=torch.float64)).abs()
+        extent = torch.tensor(edit.size, dtype=torch.float64)[_nearest_axes(grid.axes)]
     elif own:
         spans = torch.stack([thing.cells.amax(0) - thing.cells.amin(0) + 1 for thing in own])
         usual, extent = extent, spans.double().median(dim=0).values * grid.form.size
@@ -281,6 +281,15 @@ def _usual(grid: CellGrid, edit: Insert) -> tuple[Float[Tensor, " 3"], tuple[int
             extent[2] = extent[2].max(usual[2])
     colors = list(zip(*(thing.color for thing in own), strict=True))
     return extent, edit.color or (tuple(round(median(shades)) for shades in colors) if own else GREY)
+
+
+def _nearest_axes(axes: Float[Tensor, "3 3"]) -> Int64[Tensor, " 3"]:
+    """Return for each axis of the cells the number of the world's axis that is nearest to it, each once; up first."""
+    closeness, chosen = axes.abs(), torch.zeros(3, dtype=torch.long)
+    for axis in (2, 0, 1):
+        chosen[axis] = closeness[axis].argmax()
+        closeness[:, chosen[axis]] = -1.0
+    return chosen
 
 
 def _rest_level(grid: CellGrid, ground: Sequence[Tensor], count: int) -> int:
