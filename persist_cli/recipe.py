@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import os
 import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -142,6 +143,12 @@ class Recipe:
     training: TrainingSettings = field(default_factory=TrainingSettings)
 
 
+USUAL: Final = {  # names where a recipe has none
+    "backbone.name": BackboneConfig.name, "memory.name": MemoryConfig.name, "memory.encoder": MemoryConfig.encoder,
+    "policy.name": PolicyConfig.name, "scene.name": SceneConfig.name,
+}  # fmt: skip
+
+
 def changeable_on_resume() -> set[str]:
     """Dotted keys of the settings that may differ when a run is resumed."""
     hints = typing.get_type_hints(TrainingSettings, include_extras=True)
@@ -177,7 +184,7 @@ def _read_extended(name: str, extended_by: tuple[str, ...]) -> dict[str, Any]:
     if not isinstance(extended, str):
         raise RecipeError(f"{name}: {EXTENDS} is the name of a recipe or a YAML file, not {extended!r}")
     if _is_file(name) and _is_file(extended):
-        extended = str(Path(name).parent / extended)
+        extended = os.path.normpath(Path(name).parent / extended)
     base = _read_extended(extended, (*extended_by, name))
     return base | {key: _merge(key, base.get(key), value) for key, value in values.items()}
 
@@ -185,11 +192,19 @@ def _read_extended(name: str, extended_by: tuple[str, ...]) -> dict[str, Any]:
 def _merge(key: str, base: Any, value: Any) -> Any:
     """Merge a value into that of the extended recipe, key by key where both are mappings of the same variant."""
     value = {} if value is None and key in SETTINGS else value
-    if not isinstance(base, dict) or not isinstance(value, dict) or CHOSEN_BY.get(key) in value:
+    if not isinstance(base, dict) or not isinstance(value, dict):
         return value
-    if "encoder" in value:
+    if key in CHOSEN_BY and _chooses_another(f"{key}.{CHOSEN_BY[key]}", base, value):
+        return value
+    if _chooses_another("memory.encoder", base, value):
         base = {name: setting for name, setting in base.items() if name != "encoder_settings"}
     return base | {name: _merge(name, base.get(name), setting) for name, setting in value.items()}
+
+
+def _chooses_another(key: str, base: Mapping[str, Any], value: Mapping[str, Any]) -> bool:
+    """Whether a mapping names another variant than that of the extended recipe, which may leave the usual one out."""
+    choice = key.partition(".")[2]
+    return choice in value and value[choice] != base.get(choice, USUAL.get(key))
 
 
 def _recipe_text(name: str) -> str:
@@ -273,7 +288,7 @@ def apply_overrides(values: Mapping[str, Any], overrides: Sequence[str]) -> dict
     for key, value in settings:
         owner, _, choice = key.partition(".")
         mapping = changed.get(owner)
-        if not isinstance(mapping, dict) or mapping.get(choice, value) == value:
+        if not isinstance(mapping, dict) or mapping.get(choice, USUAL.get(key, value)) == value:
             continue
         if key in SETTINGS_OF:
             mapping.pop(SETTINGS_OF[key], None)

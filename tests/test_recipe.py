@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from importlib import resources
 
 import pytest
@@ -97,7 +98,7 @@ def test_a_recipe_says_only_what_differs_from_the_one_it_extends(tmp_path):
     recipe, extended = read_recipe(str(tmp_path / "a.yaml")), read_recipe("tiny-stage2-voxel")
     assert recipe["training"] == extended["training"] | {"steps": 7}
     assert recipe["memory"] == {"name": "none"}
-    assert recipe["adapter"] == {"form": "cross"}
+    assert recipe["adapter"] == extended["adapter"] | {"form": "cross"}
     assert {key: recipe[key] for key in ("stage", "base", "data")} == {
         key: extended[key] for key in ("stage", "base", "data")
     }
@@ -109,6 +110,41 @@ def test_a_recipe_changes_single_settings_of_the_memory_and_adapter_that_it_exte
     recipe, extended = read_recipe(str(tmp_path / "a.yaml")), read_recipe("tiny-stage2-voxel")
     assert recipe["adapter"] == extended["adapter"] | {"every": 2}
     assert recipe["memory"] == extended["memory"] | {"encoder": "dinov2"}
+
+
+@pytest.mark.parametrize(
+    ("base", "key", "named"),
+    [
+        ("cogvideox-5b-i2v-stage1", "backbone", {"name": "cogvideox"}),
+        ("houses-64-stage2-voxel", "memory", {"name": "voxel"}),
+        ("houses-64-stage2-voxel", "memory", {"name": "voxel", "encoder": "patches"}),
+        ("houses-64-stage2-voxel", "adapter", {"form": "rendered"}),
+        ("houses-64-policy", "policy", {"name": "nomad"}),
+    ],
+)
+def test_a_recipe_that_names_what_the_extended_one_has_anyway_keeps_its_settings(tmp_path, base, key, named):
+    (tmp_path / "a.yaml").write_text(f"extends: {base}\n{key}: {json.dumps(named)}\n")
+    recipe, extended = (make_recipe(read_recipe(name), name) for name in (str(tmp_path / "a.yaml"), base))
+    assert recipe == extended
+    overrides = [f"{key}.{name}={value}" for name, value in named.items()]
+    assert make_recipe(apply_overrides(read_recipe(base), overrides), base) == extended
+
+
+def test_a_recipe_that_names_another_variant_keeps_no_setting_of_the_usual_one(tmp_path):
+    (tmp_path / "b.yaml").write_text("backbone: {settings: {frames: 17}}\nmemory: {settings: {stride: 2}}\n")
+    (tmp_path / "a.yaml").write_text("extends: b.yaml\nbackbone: {name: mine}\nmemory: {name: points}\n")
+    recipe = read_recipe(str(tmp_path / "a.yaml"))
+    assert recipe == {"backbone": {"name": "mine"}, "memory": {"name": "points"}}
+    changed = apply_overrides(read_recipe(str(tmp_path / "b.yaml")), ["backbone.name=mine", "memory.name=points"])
+    assert changed == recipe
+
+
+def test_recipes_in_two_folders_that_extend_each_other_are_named(tmp_path):
+    for one, other in (("a", "b"), ("b", "a")):
+        (tmp_path / one).mkdir()
+        (tmp_path / one / "x.yaml").write_text(f"extends: ../{other}/x.yaml\n")
+    with pytest.raises(RecipeError, match=r"a/x.yaml: extends itself \(.*a/x.yaml -> .*b/x.yaml -> .*a/x.yaml\)"):
+        read_recipe(str(tmp_path / "a/x.yaml"))
 
 
 def test_a_recipe_changes_one_setting_of_the_backbone_and_inherits_the_others(tmp_path):
