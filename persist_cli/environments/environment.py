@@ -88,6 +88,7 @@ class HouseEnv(gymnasium.Env[Observation, Any]):
     ) -> tuple[Observation, dict[str, Any]]:
         """Begin an episode, drawn by the seed; a true house takes a given one as options."""
         super().reset(seed=seed)
+        self._attempt = None  # of a reset that is refused nothing is left to go on with
         self._attempt = self.scenes.begin(0, self.np_random, options or {})
         return self.attempt.observation(), self.attempt.info()
 
@@ -149,6 +150,7 @@ class HouseVectorEnv(VectorEnv[Observation, Array, Array]):
         for number, one in enumerate(environment_seeds(seed, self.num_envs)):
             if one is not None:
                 self._draws[number] = seeding.np_random(one)[0]
+        self._attempts = []
         self._attempts = [self.scenes.begin(number, draws, options or {}) for number, draws in enumerate(self._draws)]
         infos: dict[str, Any] = {}
         for number, attempt in enumerate(self._attempts):

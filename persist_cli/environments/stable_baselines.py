@@ -51,9 +51,17 @@ class BatchedVecEnv(VecEnv):  # type: ignore[misc]
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> Observation:
-        """Begin an episode in each environment, with the seeds of ``seed``."""
-        seen, infos = self.envs.reset(seed=self._seeds)
+        """Begin an episode in each environment, with the seeds of ``seed`` and the options of ``set_options``.
+
+        Raises:
+            PersistError: when the environments have different options, for they begin together.
+        """
+        options, *others = self._options
+        if any(other != options for other in others):
+            raise PersistError("set_options: all environments of a batch take the same options")
+        seen, infos = self.envs.reset(seed=self._seeds, options=options or None)
         self._reset_seeds()
+        self._reset_options()
         self.reset_infos = [row_of(infos, number) for number in range(self.num_envs)]
         return seen
 

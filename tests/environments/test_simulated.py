@@ -7,11 +7,12 @@ import functools
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
 import persist_cli.environments  # noqa: F401  registers them
 from persist_cli.api.simulator import Stand
-from persist_cli.errors import PersistError
+from persist_cli.errors import DataError, PersistError
 from tests.support.miniworlds import make_world
 
 NAME = "persist/SimulatedHouse-v0"
@@ -106,6 +107,23 @@ def test_an_episode_that_is_given_is_run_as_it_is():
     assert np.array_equal(other.unwrapped.attempt.goal.position, goal.position)
     with pytest.raises(PersistError, match="options of reset: goal is missing"):
         other.reset(options={"scene": 3, "start": episode["start"]})
+
+
+def test_after_a_reset_that_is_refused_there_is_no_episode_to_go_on_with():
+    env, vector = make().unwrapped, gymnasium.make_vec(NAME, num_envs=2, **HOUSES).unwrapped
+    env.reset(seed=2)
+    vector.reset(seed=2)
+    house = env.scenes.houses[0]
+    ground, heading = house.simulator.agent
+    start = {"ground": ground, "heading": heading}
+    nowhere = {"scene": house._seed, "start": start, "goal": {"ground": (1000.0, 0.0), "heading": 0.0}}
+    for reset in (env.reset, vector.reset):
+        with pytest.raises(DataError, match="is not free"):
+            reset(options=nowhere)
+    with pytest.raises(ResetNeeded):
+        env.step(0)
+    with pytest.raises(ResetNeeded):
+        vector.step(np.zeros(2, np.int64))
 
 
 def test_the_way_round_a_wall_is_longer_than_the_line_through_it():

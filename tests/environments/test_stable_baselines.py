@@ -106,6 +106,27 @@ def test_the_example_learns_in_a_scene_that_was_made_of_one_image(monkeypatch, t
     assert "goals reached in the true house: " in capsys.readouterr().out
 
 
+def test_options_are_those_of_all_environments_until_the_next_reset():
+    make_world()
+    single = gymnasium.make(**TRUE)
+    single.reset(seed=2)
+    house = single.unwrapped.scenes.houses[0]
+    ground, heading = house.simulator.agent
+    goal = {"ground": house._goal, "heading": 0.0}
+    episode = {"scene": house._seed, "start": {"ground": ground, "heading": heading}, "goal": goal}
+    envs = BatchedVecEnv(gymnasium.make_vec(num_envs=2, **TRUE))
+    envs.set_options(episode)
+    envs.reset()
+    left = single.unwrapped.attempt.now.left
+    assert [info["distance"] for info in envs.reset_infos] == [left, left]
+    envs.seed(7)
+    envs.reset()
+    assert [info["distance"] for info in envs.reset_infos] != [left, left]
+    envs.set_options([episode, {}])
+    with pytest.raises(PersistError, match="all environments of a batch take the same options"):
+        envs.reset()
+
+
 def test_the_network_takes_a_place_as_its_goal_and_says_so():
     make_world()
     with pytest.raises(PersistError, match="take observe_goal='place'"):
