@@ -403,7 +403,7 @@ def print_collisions(result: dict[str, Any]) -> None:
         return "–" if figure["mean"] != figure["mean"] else f"{100 * figure['mean']:.1f}{bounds}"
 
     rows = [
-        [row["name"], cell(row["precision"]), cell(row["recall"]), f"{100 * row['unknown']['mean']:.1f}", row["knows"]]
+        [row["name"], cell(row["precision"]), cell(row["recall"]), cell(row["unknown"]).split(" [")[0], row["knows"]]
         for row in result["rows"]
     ]
     first = result["rows"][0]

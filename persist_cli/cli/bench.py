@@ -156,7 +156,7 @@ def episode_source(file: Path | None, scenes: str | None, bins: str | None, each
     """Return where the episodes of `bench plan` come from, by its options."""
     from persist_cli.bench.plans.plan_bench import EpisodeSource
 
-    return EpisodeSource.of(file, scenes, whole_numbers("--bins", bins) if bins else None, each)
+    return EpisodeSource.of(file, scenes, None if bins is None else whole_numbers("--bins", bins), each)
 
 
 @bench_app.command("plan")
@@ -205,7 +205,7 @@ def bench_plan(
         approach=approach, explore=explore).of_cem(settings, candidates, rounds)  # fmt: skip
     run_plan_bench.run_plan_bench(plan_bench.BenchPlan(
         source=episode_source(episodes, scenes, bins, each), checkpoint=checkpoint, policy=policy, cost=cost,
-        rows=split_names(rows) if rows else None, memories=split_names(memories), loops=split_names(loops),
+        rows=None if rows is None else split_names(rows), memories=split_names(memories), loops=split_names(loops),
         planning=planning, loop=run_episode.LoopSettings(execute, patience, max_actions=max_actions),
         sampling=SamplingOverrides(steps, sampler, guidance, autoguidance=autoguidance), stop_cost=stop_cost,
         placement=InferenceOptions.of(dtype, save_memory), allow_training_scenes=allow_training_scenes,

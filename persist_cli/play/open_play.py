@@ -20,7 +20,7 @@ from persist_cli.memorize.sources import Source, find_sources
 from persist_cli.output.console import busy
 from persist_cli.play.play import Play
 from persist_cli.play.settings import PlaySettings
-from persist_cli.play.start import StartOptions, read_start
+from persist_cli.play.start import SAMPLE_FRAMES, StartOptions, read_start
 from persist_cli.play.walkers import AdaptedWorld
 from persist_cli.rollout.open_world import body_for, open_memory
 from persist_cli.rollout.world_model import Agent
@@ -128,6 +128,8 @@ def find_given(given: Sequence[str], checkpoint: Checkpoint, names: Sequence[str
             advice = f"add {readers[0]!r} to --memories" if readers else "no adapter of this model does"
             raise CheckpointError(f"{text}: a memory of kind {kind!r}, which {', '.join(names)} cannot read; {advice}")
     frames = [text for text in given if not is_memory_file(text)]
+    if not kinds and any(text != SAMPLE_FRAMES for text in frames):
+        raise CheckpointError(f"{frames[0]}: {PLAIN} remembers no frames; name another memory in --memories")
     return find_sources(frames) if frames else []
 
 

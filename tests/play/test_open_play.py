@@ -101,6 +101,8 @@ def test_memories_that_do_not_fit_are_refused(persist, voxel, walks, tmp_path):
         opened(voxel, f"{walks}#0:0", memories=("scene",))
     with pytest.raises(CheckpointError, match="which stage1 cannot read; add 'voxel' to --memories"):
         opened(voxel, f"{walks}#0:0", memories=("stage1",), given=(str(memory),))
+    with pytest.raises(CheckpointError, match="stage1 remembers no frames; name another memory in --memories"):
+        opened(voxel, f"{walks}#0:0", memories=("stage1",), given=(f"{walks}#0:0-4",))
     with pytest.raises(DataError, match="is of scene 'room-1', the start of 'room-0'"):
         opened(voxel, f"{walks}#0:0", given=(f"{walks}#1:0-4",))
     with pytest.raises(PersistError, match="no checkpoint there"):

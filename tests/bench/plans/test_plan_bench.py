@@ -167,6 +167,12 @@ def test_rows_of_one_folder_are_refused_before_any_is_run() -> None:
         check_row_folders(rows)
 
 
+@pytest.mark.parametrize(("option", "cause"), [("--rows", "no row is left"), ("--bins", "whole numbers separated")])
+def test_an_empty_list_of_rows_or_bins_is_not_taken_for_the_usual_one(bench: Bench, option: str, cause: str) -> None:
+    ended = bench(option, "")
+    assert (ended.code, cause in ended.err) == (1, True), ended.err
+
+
 def test_rows_can_be_added_but_other_settings_are_refused(bench: Bench) -> None:
     options = ("--cost", "distance", "--loops", "closed", "--patience", 1)
     assert bench(*options, "--rows", "random").code == 0
