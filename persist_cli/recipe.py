@@ -18,7 +18,7 @@ from pydantic import BeforeValidator
 from persist_cli.api.stages import SCENE_STAGES, STAGES, Adversarial, Distill, Lora, Stage
 from persist_cli.errors import RecipeError, hint
 from persist_cli.io.settings import parse_settings
-from persist_cli.io.yaml_text import read_yaml
+from persist_cli.io.yaml_text import parse_yaml_mapping, read_yaml
 from persist_cli.training_settings import CHANGEABLE, DataSettings, TrainingSettings
 
 EXTENDS: Final = "extends"
@@ -249,25 +249,6 @@ def recipe_comment(name: str) -> list[str]:
 
 def _is_file(name: str) -> bool:
     return Path(name).suffix in {".yaml", ".yml"}
-
-
-def parse_yaml_mapping(text: str, where: str) -> dict[str, Any]:
-    """The values of a YAML mapping.
-
-    Args:
-        text: YAML.
-        where: the recipe's name or file, with which error messages begin.
-
-    Raises:
-        RecipeError: one line that says where the text stops being YAML or has a key twice, or that it is no mapping.
-    """
-    try:
-        values = read_yaml(text)
-    except (yaml.YAMLError, ValueError) as error:  # the latter for a date such as 2024-13-45
-        raise RecipeError(f"{where}: not YAML ({' '.join(str(error).split())})") from error
-    if not isinstance(values, dict):
-        raise RecipeError(f"{where}: a recipe is a mapping of settings, not {type(values).__name__}")
-    return values
 
 
 def apply_overrides(values: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:

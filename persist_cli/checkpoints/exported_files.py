@@ -14,8 +14,8 @@ from persist_cli.checkpoints.lineage import RECIPE, RECIPES
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import read_json, read_tensors, write_json, write_tensors, write_text
 from persist_cli.io.sha256sums import SUMS, read_sums
+from persist_cli.io.yaml_text import parse_yaml_mapping
 from persist_cli.output.console import print_json, print_table, say
-from persist_cli.recipe import parse_yaml_mapping
 
 MADE_ANEW: Final = {CARD, RECIPE, SUMS}  # files at the top of a checkpoint's folder that an export does not copy
 

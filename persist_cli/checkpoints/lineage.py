@@ -15,8 +15,9 @@ from persist_cli.data.reference import data_folder
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError, PersistError
 from persist_cli.io.files import read_json, write_text
+from persist_cli.io.yaml_text import parse_yaml_mapping
 from persist_cli.output.console import warn
-from persist_cli.recipe import parse_yaml_mapping, read_recipe_file, recipe_values
+from persist_cli.recipe import read_recipe_file, recipe_values
 
 RECIPE: Final = "recipe.yaml"  # of the last stage, in the checkpoint folder of a run
 

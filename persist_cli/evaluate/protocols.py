@@ -294,8 +294,8 @@ class ThereAndBack(Protocol):
             poses, twice, length = found[file.path]
             if len(cases) == search.limit or len(poses) < max(frames, LEAST_RETURN_FRAMES):
                 continue
-            start = (twice - frames + 1) // 2
-            if length < frames or not goes_away(poses[start : start + frames]):
+            start: int | None = (twice - frames + 1) // 2 if length >= frames else None
+            if start is None or not goes_away(poses[start : start + frames]):
                 start = best_start(poses, frames, search)
             if start is not None and goes_away(poses[start : start + frames]):
                 cases.append(self.make_returning_case(file, start, frames, search))

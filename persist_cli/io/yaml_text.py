@@ -7,6 +7,8 @@ from typing import Any, Final
 
 import yaml
 
+from persist_cli.errors import RecipeError
+
 MOST: Final = 100_000  # values that a text may stand for, those of its aliases counted each time
 
 
@@ -55,3 +57,22 @@ def _values_in(node: yaml.Node, counted: dict[yaml.Node, int]) -> int:
     if not counted[node]:
         raise ValueError("a value of it contains itself")
     return counted[node]
+
+
+def parse_yaml_mapping(text: str, where: str) -> dict[str, Any]:
+    """The values of a YAML mapping.
+
+    Args:
+        text: YAML.
+        where: the recipe's name or file, with which error messages begin.
+
+    Raises:
+        RecipeError: one line that says where the text stops being YAML or has a key twice, or that it is no mapping.
+    """
+    try:
+        values = read_yaml(text)
+    except (yaml.YAMLError, ValueError) as error:  # the latter for a date such as 2024-13-45
+        raise RecipeError(f"{where}: not YAML ({' '.join(str(error).split())})") from error
+    if not isinstance(values, dict):
+        raise RecipeError(f"{where}: a recipe is a mapping of settings, not {type(values).__name__}")
+    return values

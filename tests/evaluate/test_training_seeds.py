@@ -17,7 +17,7 @@ from persist_cli.evaluate.report.text import table_text
 from persist_cli.evaluate.rows.build_rows import named_owners
 from persist_cli.evaluate.rows.training_seeds import check_any_grouped, group_by_training, training_of
 from persist_cli.io.files import read_json
-from persist_cli.recipe import parse_yaml_mapping
+from persist_cli.io.yaml_text import parse_yaml_mapping
 from tests.support.example_results import example_results
 
 RECIPE = "stage: '2'\nbase: runs/stage1-{seed}\ndata: {{path: [houses]}}\ntraining: {{seed: {seed}, steps: {steps}}}\n"

@@ -15,7 +15,8 @@ from persist_cli.api.inference import SamplingOverrides
 from persist_cli.checkpoints.lineage import training_scenes
 from persist_cli.checkpoints.load import load_backbone
 from persist_cli.errors import RecipeError
-from persist_cli.recipe import make_recipe, parse_yaml_mapping
+from persist_cli.io.yaml_text import parse_yaml_mapping
+from persist_cli.recipe import make_recipe
 from persist_cli.train.run_folder import source_scenes
 from persist_cli.train.trainer import Trainer
 from tests.support.export_runs import write_weaker

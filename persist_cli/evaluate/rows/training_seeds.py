@@ -11,7 +11,7 @@ from persist_cli.api.checkpoint import Checkpoint
 from persist_cli.checkpoints.lineage import ADAPTERS, adapter_recipe, stage_recipes
 from persist_cli.errors import CheckpointError
 from persist_cli.io.begun_with import first_difference
-from persist_cli.recipe import parse_yaml_mapping
+from persist_cli.io.yaml_text import parse_yaml_mapping
 
 OWN = ("base", "description", "chosen_on")  # keys of a recipe that may differ between training seeds
 
