@@ -233,7 +233,7 @@ def check_frozen(config: BackboneConfig, base: Checkpoint) -> None:
         if before != now and field.name not in kind.for_training:
             raise RecipeError(
                 f"backbone.settings.{field.name}: base {base.folder} has {before!r}, and stage 2 leaves its video "
-                f"model as it is; leave it out, or train stage 1 on with {now!r}"
+                f"model as it is; give that, or train stage 1 on with {now!r}"
             )
 
 

@@ -13,7 +13,7 @@ def test_stage_2_refuses_settings_that_its_base_was_not_trained_with(persist, wa
     result = persist(*stage("stage2-voxel", walks, tmp_path / "out", f"base={stage1}", change))
     assert result.code == 1
     assert f"error: backbone.settings.{name}: base {stage1}" in result.err
-    assert "leave it out, or train stage 1 on with" in result.err
+    assert "give that, or train stage 1 on with" in result.err
     assert not (tmp_path / "out").exists()
 
 
