@@ -204,13 +204,13 @@ def start_backbone(recipe: Recipe, base: Checkpoint | None) -> Backbone:
         raise RecipeError(
             f"base {base.folder}: a codec alone, whose video model was not trained; train stage 1 on it, and name that"
         )
-    if recipe.memory is not None:
-        check_frozen(config, base)
     if codec_alone and recipe.stage == "1":
         return fresh_on_codec(base, config.settings)
     built_by = load_plugin("backbone", config.name).built_by
     changed = changed_settings(base.settings, {key: config.settings[key] for key in built_by if key in config.settings})
     if not changed:
+        if recipe.memory is not None:
+            check_frozen(config, base)
         return load_backbone(base, config.settings)
     if not is_own_codec(base):
         raise RecipeError(

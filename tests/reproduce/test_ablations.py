@@ -91,7 +91,8 @@ def test_the_papers_recipe_has_what_the_paper_says():
     recipe = make_recipe(read_recipe(PREFIX), PREFIX)
     assert recipe.memory is not None
     assert (recipe.memory.name, recipe.memory.encoder) == ("voxel", "dinov2")
-    assert recipe.memory.settings == {"cell": [0.25, 1.0, 0.25], "pooling": "max", "stride": 2}
+    settings = {"cell": [0.25, 1.0, 0.25], "pooling": "max", "stride": 2, "imagined": "merge", "closing": 1.0}
+    assert recipe.memory.settings == settings
     assert (recipe.adapter["form"], recipe.adapter["every"]) == ("cross", 1)
 
 
