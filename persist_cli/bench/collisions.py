@@ -398,12 +398,15 @@ def print_collisions(result: dict[str, Any]) -> None:
     """Print the table of a result."""
 
     def cell(figure: dict[str, float]) -> str:
-        low, high = figure["low"], figure["high"]
-        bounds = f" [{100 * low:.0f}, {100 * high:.0f}]" if low < high else ""
-        return "–" if figure["mean"] != figure["mean"] else f"{100 * figure['mean']:.1f}{bounds}"
+        mean, low, high = figure["mean"], figure["low"], figure["high"]
+        bounds = f" [{100 * low:.0f}, {100 * high:.0f}]" if low < high and not math.isnan(mean) else ""
+        return percent(mean) + bounds
+
+    def percent(share: float) -> str:
+        return "–" if math.isnan(share) else f"{100 * share:.1f}"
 
     rows = [
-        [row["name"], cell(row["precision"]), cell(row["recall"]), cell(row["unknown"]).split(" [")[0], row["knows"]]
+        [row["name"], cell(row["precision"]), cell(row["recall"]), percent(row["unknown"]["mean"]), row["knows"]]
         for row in result["rows"]
     ]
     first = result["rows"][0]

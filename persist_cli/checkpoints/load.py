@@ -53,13 +53,15 @@ def empty_backbone(checkpoint: Checkpoint, settings: dict[str, Any] | None = Non
     return backbone
 
 
-def checked_sampling(checkpoint: Checkpoint, overrides: SamplingOverrides) -> Sampling:
+def checked_sampling(checkpoint: Checkpoint, overrides: SamplingOverrides, protocol: str = "") -> Sampling:
     """Return the sampling of the checkpoint's card with these overrides, checked before any weights are read.
+
+    Arguments are those of ``Checkpoint.sampling_with``.
 
     Raises:
         PersistError: when the backbone cannot sample so.
     """
-    sampling = checkpoint.sampling_with(overrides)
+    sampling = checkpoint.sampling_with(overrides, protocol)
     empty_backbone(checkpoint).check_sampling(sampling)
     check_noise(sampling, [checkpoint])
     return sampling

@@ -125,24 +125,26 @@ def adapter_of(checkpoint: Checkpoint, memory: str | None) -> tuple[MemoryConfig
     if memory is None and checkpoint.default is None and len(memories) > 1:
         known = ", ".join(dict.fromkeys(memories.values()))
         raise CheckpointError(f"{checkpoint.folder}: choose a memory of {known} with --memory")
-    readers = [adapter for adapter, name in memories.items() if memory in (None, name)]
-    preferred = [name for name in (memory, checkpoint.default) if name in readers]
-    if not readers:
+    adapter = _reader(checkpoint, memory)
+    if adapter is None:
         text = "a memory" if memory is None else f"a memory {memory!r}"
         raise CheckpointError(
             f"{checkpoint.folder}: no adapter reads {text}; it has {', '.join(memories) or 'no adapter'}"
         )
-    adapter = str([*preferred, *readers][0])
     return adapter_memory(checkpoint, adapter), f"adapter {adapter!r} of {checkpoint.folder}"
 
 
 def reading_adapter(checkpoint: Path | None, memory: str) -> str | None:
     """The adapter that reads a memory of this name, of a checkpoint or else of the packaged one, where it has one."""
     found = _find_reference_checkpoint() if checkpoint is None else find_checkpoint(checkpoint)
-    if found is None:
-        return None
-    readers = [adapter for adapter, name in _memory_names(found).items() if name == memory]
-    return memory if memory in readers else next(iter(readers), None)
+    return None if found is None else _reader(found, memory)
+
+
+def _reader(checkpoint: Checkpoint, memory: str | None) -> str | None:
+    """The adapter that reads a memory of this name, or any: one of its own name, the default one, or the first."""
+    readers = [adapter for adapter, name in _memory_names(checkpoint).items() if memory in (None, name)]
+    preferred = [name for name in (memory, checkpoint.default) if name is not None and name in readers]
+    return next(iter([*preferred, *readers]), None)
 
 
 def _memory_names(checkpoint: Checkpoint) -> dict[str, str]:

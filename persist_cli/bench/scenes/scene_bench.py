@@ -34,7 +34,7 @@ from persist_cli.bench.scenes.journal import SceneJournal
 from persist_cli.bench.scenes.training_houses import House, read_houses
 from persist_cli.bench.scenes.views import Region, View, near_camera, same_form, true_region
 from persist_cli.checkpoints.contamination import ALLOW, OTHER_DATA, ShownScene, known_names, refuse_training_scenes
-from persist_cli.checkpoints.load import check_noise, empty_backbone
+from persist_cli.checkpoints.load import checked_sampling
 from persist_cli.checkpoints.scene_models import TrainedSceneModel, find_scene_model
 from persist_cli.data.reference import data_folder, parse_reference
 from persist_cli.data.store import Store, TrajectoryFile
@@ -193,12 +193,9 @@ def prepare(plan: SceneBenchPlan, out: Path) -> SceneBench:
 def check_samplings(plan: RenderingPlan, parts: Sequence[str]) -> None:
     """Raise ``PersistError`` when the world model cannot sample as a part asks it to, before weights are read."""
     checkpoint = find_checkpoint(plan.checkpoint)
-    backbone = empty_backbone(checkpoint)
     for part in parts:
         if part in RENDERED:
-            sampling = checkpoint.sampling_with(plan.sampling, RENDERED[part])
-            backbone.check_sampling(sampling)
-            check_noise(sampling, [checkpoint])
+            checked_sampling(checkpoint, plan.sampling, RENDERED[part])
 
 
 def check_model(trained: TrainedSceneModel, files: Sequence[TrajectoryFile], allowed: bool) -> None:
