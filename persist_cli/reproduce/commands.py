@@ -7,10 +7,11 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from types import FrameType
 from typing import Final
 
 from persist_cli.cli.options import outlive_listeners, print_any_letter
-from persist_cli.errors import INTERRUPTED, PersistError
+from persist_cli.errors import PersistError
 from persist_cli.io.signals import caught_signals
 from persist_cli.output.console import say
 
@@ -18,11 +19,26 @@ COLLECT: Final = "collect miniworld --size 64x64"
 
 
 def run_command(command: Sequence[str]) -> int:
-    """Run a command and return its exit code; after Ctrl-C the command is given the time to end."""
-    interrupts: list[int] = []
-    with caught_signals(lambda number, _: interrupts.append(number), [signal.SIGINT]):  # a child does not inherit it
-        code = subprocess.run(command, check=False).returncode
-    return INTERRUPTED if interrupts else code
+    """Run a command and return its exit code; one that is asked to stop is given the time to end.
+
+    Ctrl-C reaches all processes of a terminal. SIGTERM and SIGHUP, which may reach this process alone, are passed on.
+
+    Returns:
+        the exit code; after a signal that asked this process to stop, 128 and the signal's number.
+    """
+    stops: list[int] = []
+    running: list[subprocess.Popen[bytes]] = []
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        stops.append(number)
+        if number != signal.SIGINT:
+            for process in running:
+                process.send_signal(number)
+
+    with caught_signals(stop):  # a child does not inherit it
+        running.append(subprocess.Popen(command))
+        code = running[0].wait()
+    return 128 + stops[0] if stops else code
 
 
 def run_main(main: Callable[[Sequence[str]], None]) -> None:
@@ -39,7 +55,7 @@ def run_line(line: str) -> None:
     """Run a command of persist in a process of its own; end this one with its exit code when it fails."""
     say(f"\n$ persist {line}")
     code = run_command([sys.executable, "-m", "persist_cli", *shlex.split(line)])
-    if code == INTERRUPTED:
+    if code > 128:
         say("stopped; the same command goes on here")
     if code:
         sys.exit(code)

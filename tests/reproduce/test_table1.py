@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
-import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -16,7 +12,6 @@ import torch
 from persist_cli.api.backbone import Sampling
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.checkpoint import reference_checkpoint
-from persist_cli.errors import INTERRUPTED
 from persist_cli.io.files import write_json
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.metrics import METRICS
@@ -46,14 +41,6 @@ LINES = commands(OUT, CHOICES)
 
 TRAININGS = [line for line in LINES if line.startswith("finetune")]
 
-WAITING = """
-import sys
-from persist_cli.reproduce.commands import run_command
-child = "import sys, time\\ntry: print('begun', flush=True); time.sleep(60)"
-child += "\\nexcept KeyboardInterrupt: time.sleep(0.5); print('ended', flush=True)"
-sys.exit(run_command([sys.executable, "-c", child]))
-"""
-
 
 @pytest.mark.parametrize("line", [*LINES, *reference_commands(OUT)])
 def test_every_command_is_one_that_persist_takes(line: str) -> None:
@@ -78,16 +65,6 @@ def test_a_folder_with_a_blank_in_its_name_is_one_folder() -> None:
     folders = [word for line in LINES for word in shlex.split(line) if "table1" in word]
     assert {word.removeprefix("base=").split("/")[0] for word in folders} == {"my runs"}
     assert not [word for line in LINES for word in shlex.split(line) if word == "runs"]
-
-
-def test_an_interrupt_lets_the_command_end_without_a_traceback() -> None:
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    process = subprocess.Popen([sys.executable, "-c", WAITING], text=True, start_new_session=True, **pipes)
-    assert process.stdout is not None
-    assert process.stdout.readline() == "begun\n"
-    os.killpg(process.pid, signal.SIGINT)
-    assert process.communicate() == ("ended\n", "")
-    assert process.returncode == INTERRUPTED
 
 
 def test_every_recipe_of_the_reference_model_is_trained_after_its_base() -> None:
