@@ -31,6 +31,8 @@ from persist_cli.cli.options import (
 
 planning_app = typer.Typer()
 
+IMAGINING = "checkpoint adapter steps sampler guidance context_noise autoguidance dtype save_memory"  # options of it
+
 
 MethodOption = Annotated[str, typer.Option(help="rank: a policy proposes; cem: the best of a round lead the next.")]
 ProposingOption = Annotated[
@@ -61,7 +63,7 @@ def plan(
     body: BodyOption = None,
     step: StepOption = None,
     turn: TurnOption = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of candidates and sampling noise.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Of candidates and sampling noise.")] = 0,
     steps: Annotated[int, typer.Option(min=1, help="Denoising steps; one orders candidates about as well as 20.")] = 1,
     sampler: SamplerOption = None,
     guidance: Annotated[float, typer.Option(min=0, help="Of guidance over memory; 1: none.")] = 1.0,
@@ -109,7 +111,7 @@ def learn(
     episodes: Annotated[Path | None, typer.Option(help="Of `persist bench episodes`: to evaluate in truth.")] = None,
     patience: Annotated[float, typer.Option(min=1, help="Most actions, as a multiple of the shortest way's.")] = 4,
     stop_cost: Annotated[float, typer.Option(min=0, help="LPIPS of view and goal at which it stops there.")] = 0.17,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of everything random.")] = 0,
     steps: StepsOption = None, sampler: SamplerOption = None, guidance: GuidanceOption = None,
     context_noise: ContextNoiseOption = None, autoguidance: AutoguidanceOption = None,
     dtype: DtypeOption = None,
@@ -127,8 +129,7 @@ def learn(
     from persist_cli.learn.learn import LearnPlan, run_learn
     from persist_cli.learn.practice import PracticeSettings
 
-    if episodes is None:
-        refuse_options(context, "patience stop_cost", "only with --episodes, which are run so")
+    _refuse_unused(context, episodes, inside)
     run_learn(LearnPlan(
         views=tuple(views), policy=policy, inside=inside, checkpoint=checkpoint, adapter=adapter, rounds=rounds,
         practice=PracticeSettings(
@@ -138,3 +139,10 @@ def learn(
         placement=InferenceOptions.of(dtype, save_memory), seed=seed, body=body, stop_cost=stop_cost,
         allow_training_scenes=allow_training_scenes,
     ), out, json)  # fmt: skip
+
+
+def _refuse_unused(context: typer.Context, episodes: Path | None, inside: str) -> None:
+    if episodes is None:
+        refuse_options(context, "patience stop_cost", "only with --episodes, which are run so")
+    if inside == "simulator":
+        refuse_options(context, IMAGINING, "the true house needs no model and no memory; leave out --inside simulator")

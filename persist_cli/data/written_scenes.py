@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-import zlib
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Final, Protocol
 
 import numpy as np
@@ -26,7 +26,7 @@ from persist_cli.errors import PluginError
 from persist_cli.plugins import find_plugin, load_plugin, make_encoder, make_settings
 
 MEMORY: Final = "scene"  # the plugin that is written
-FORMAT: Final = 1  # of what is kept
+FORMAT: Final = 2  # of what is kept
 MOST_KEPT: Final = 2000  # of the latest scenes, about 30 kB each, when there is no cache
 
 
@@ -63,7 +63,7 @@ class SceneWriter:
 
     def __init__(self, form: CellForm, cache: TensorStore | None = None) -> None:
         self.form, self.cache = form, cache
-        self._fingerprints: dict[str, int] = {}  # of the poses of trajectories
+        self._hashes: dict[Path, str] = {}  # of trajectories' files
         self._latest: OrderedDict[str, dict[str, Tensor]] = OrderedDict()
 
     def scene(self, file: TrajectoryFile, frames: Sequence[int]) -> WrittenScene:
@@ -112,14 +112,11 @@ class SceneWriter:
         return scene.cells
 
     def _key(self, file: TrajectoryFile, frames: Sequence[int]) -> str:
-        """A hash of all that a scene depends on, but the pixels; those depend on poses, size and intrinsics."""
-        info = file.info
-        depends = [FORMAT, self._version, asdict(self.form), file.name, info.scene, str(info.source), *frames]
-        depends += [info.height, info.width, info.intrinsics.tolist()]
-        if str(file.path) not in self._fingerprints:
-            self._fingerprints[str(file.path)] = zlib.crc32(file.poses().numpy().tobytes())
-        poses = self._fingerprints[str(file.path)]
-        return hashlib.sha256(json.dumps([*depends, poses]).encode()).hexdigest()
+        """A hash of all that a scene depends on."""
+        if file.path not in self._hashes:
+            self._hashes[file.path] = file.sha256
+        depends = [FORMAT, self._version, asdict(self.form), self._hashes[file.path], *frames]
+        return hashlib.sha256(json.dumps(depends).encode()).hexdigest()
 
     def _kept(self, key: str) -> dict[str, Tensor] | None:
         if self.cache is not None:

@@ -225,8 +225,8 @@ def environment_seeds(seed: int | Sequence[int | None] | None, count: int) -> Se
     Raises:
         ValueError: when there are not as many as environments.
     """
-    if seed is None or isinstance(seed, int):
-        return [None if seed is None else seed + number for number in range(count)]
+    if seed is None or isinstance(seed, int | np.integer):
+        return [None if seed is None else int(seed) + number for number in range(count)]
     if len(seed) != count:
         raise ValueError(f"{len(seed)} seeds for {count} environments")
     return seed

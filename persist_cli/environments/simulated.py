@@ -18,7 +18,7 @@ from persist_cli.errors import DataError
 from persist_cli.io.settings import parse_settings
 from persist_cli.simulators.checked import checked_simulator
 from persist_cli.simulators.collect import CollectPlan, random_start
-from persist_cli.simulators.free_grid import Cell, FreeGrid, Ground, clear_distance
+from persist_cli.simulators.free_grid import FreeGrid, Geodesic, Ground, clear_distance
 
 NAME: Final = "persist/SimulatedHouse-v0"
 
@@ -117,7 +117,7 @@ class OpenHouse:
         self._seed: int | None = None
         self._grid: FreeGrid
         self._goal: Ground = (0.0, 0.0)
-        self._distances: dict[Cell, float] = {}
+        self._geodesic: Geodesic
 
     def open(self, seed: int) -> None:
         """Open the scene of a generator's seed, unless it is open."""
@@ -143,7 +143,7 @@ class OpenHouse:
 
     def begin(self, start: Stand, goal: Stand) -> Attempt:
         """Put the agent at a start, with the view at the goal in mind; ``DataError`` where one of them is not free."""
-        self._goal, self._distances = goal.ground, self._grid.distances(goal.ground)
+        self._goal, self._geodesic = goal.ground, Geodesic(self.simulator, goal.ground, self._grid)
         shown = self._look_from(goal)
         view, info = self._look_from(start), self.simulator.info
         seen = Goal(torch.from_numpy(shown.rgb), torch.from_numpy(shown.world_from_camera[:3, 3]), info.scene)
@@ -155,12 +155,15 @@ class OpenHouse:
 
     def _draw_goal(self, start: Ground, draws: np.random.Generator) -> Stand | None:
         """Draw a place and a heading with an open view; ``None`` when this start has none."""
-        distances = self._grid.distances(start)
-        places = [self._grid.place(cell) for cell in sorted(distances)]
-        far = [place for place in places if self.task.is_far_enough(self._metres(place, start, distances))]
+        geodesic = Geodesic(self.simulator, start, self._grid)
+        straight = self.task.distance == "straight"
+        places = geodesic.places()
+        metres = [math.dist(place, start) if straight else geodesic.along_grid(place) for place in places]
+        far = [place for place, away in zip(places, metres, strict=True) if self.task.is_far_enough(away)]
         for _ in range(TRIES if far else 0):
             place, heading = far[int(draws.integers(len(far)))], float(draws.uniform(-math.pi, math.pi))
-            if clear_distance(self.simulator, place, heading, OPEN_VIEW, OPEN_VIEW):
+            is_open = clear_distance(self.simulator, place, heading, OPEN_VIEW, OPEN_VIEW)
+            if is_open and (straight or self.task.is_far_enough(geodesic.metres(place))):
                 return Stand(place, heading)
         return None
 
@@ -170,14 +173,11 @@ class OpenHouse:
 
     def _view(self, free: bool) -> View:
         frame = self.simulator.observe()
-        left = self._metres(self.simulator.agent[0], self._goal, self._distances)
-        return View(frame.rgb, frame.depth, frame.world_from_camera, left, free)
+        return View(frame.rgb, frame.depth, frame.world_from_camera, self._metres_left(), free)
 
-    def _metres(self, ground: Ground, goal: Ground, distances: dict[Cell, float]) -> float:
-        """Metres from a place to a goal: straight, or along the ways that ``distances`` has."""
-        if self.task.distance == "straight":
-            return math.dist(ground, goal)
-        return self._grid.metres(ground, distances)
+    def _metres_left(self) -> float:
+        ground = self.simulator.agent[0]
+        return math.dist(ground, self._goal) if self.task.distance == "straight" else self._geodesic.metres(ground)
 
 
 class SimulatedHouse(HouseEnv):

@@ -18,10 +18,10 @@ from persist_cli.api.observations import Observations
 from persist_cli.api.simulator import Simulator, Stand, random_ground
 from persist_cli.episodes.episodes import SIGHT_SHARE, Episode, GivenWalk
 from persist_cli.episodes.shortest_actions import ShortestActions
-from persist_cli.episodes.true_scene import Geodesic, look_from, observations_of, stand
+from persist_cli.episodes.true_scene import look_from, observations_of, stand
 from persist_cli.errors import DataError, hint
 from persist_cli.evaluate.coverage import seen_share
-from persist_cli.simulators.free_grid import FreeGrid
+from persist_cli.simulators.free_grid import FreeGrid, Geodesic
 from persist_cli.simulators.policies import go_to
 from persist_cli.simulators.way_back import Key, Pose
 

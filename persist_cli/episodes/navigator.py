@@ -180,7 +180,7 @@ class Navigator:
         self.simulator = scene.simulator
         self.decisions = 0
         self.writing = 0.0  # seconds of taking in what was seen
-        self.least = math.inf  # cost of the best true view from which the agent approached the goal
+        self.least = math.inf  # cost of the best true view since the agent last recognised the goal
         self.decide_once = self._decider(scene.simulator, horizon)
 
     def saw(self, frames: Observations, executed: int) -> None:
@@ -213,8 +213,9 @@ class Navigator:
             self.ground.add_collision(frame.cameras[0], forward)
 
     def decide(self) -> Decision:
-        """Return the next actions."""
+        """Return the next actions where the goal is not recognised."""
         begun = time.monotonic()
+        self.least = math.inf
         generator = torch.Generator().manual_seed(self.seed * DECISIONS + self.decisions)
         situation = Situation(self.seen, self.info, self.goal, self.ground.map())
         self.decisions += 1

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 
 from persist_cli.api.simulator import Simulator
+from persist_cli.errors import DataError
 from persist_cli.simulators.free_grid import FINE, Ground
 from persist_cli.simulators.way_back import Key, Pose, actions_to
 
@@ -18,12 +19,15 @@ class ShortestActions:
     """Breadth-first search over poses by steps forward and turns, each of which counts one.
 
     Poses in one cell of half a step with one heading are held for the same, and the first one found stays; so a way may
-    be an action longer than the very shortest. A turn must be a whole part of a full circle.
+    be an action longer than the very shortest.
 
     Args:
         simulator: has an open scene, in which only this agent moves.
         start: where the ways begin.
         longest: number of actions of the longest ways.
+
+    Raises:
+        DataError: when a turn is no whole part of a full circle.
     """
 
     def __init__(self, simulator: Simulator, start: Pose, longest: int) -> None:
@@ -31,6 +35,8 @@ class ShortestActions:
         self._simulator, self._start = simulator, start
         self._step, self._turn = vocabulary["forward"].forward, vocabulary["left"].turn
         self._headings = max(1, round(360 / self._turn))
+        if abs(self._headings * self._turn - 360) > 1e-6:
+            raise DataError(f"turns of {self._turn:g}° never make a full circle; take a whole part of 360°")
         first = self._key(start.ground, 0)
         self._came: dict[Key, tuple[Key, str] | None] = {first: None}
         self._grounds = {first: start.ground}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
@@ -15,7 +14,7 @@ from persist_cli.api.policy import Goal
 from persist_cli.api.simulator import Simulator, Stand
 from persist_cli.episodes.episodes import Episode
 from persist_cli.errors import DataError
-from persist_cli.simulators.free_grid import FINE, FreeGrid, Ground
+from persist_cli.simulators.free_grid import Geodesic
 
 
 def observations_of(frames: Sequence[Frame], info: TrajectoryInfo) -> Observations:
@@ -41,33 +40,6 @@ def look_from(simulator: Simulator, at: Stand) -> Observations:
     """Return the frame that is seen from a place, and leave the agent there."""
     stand(simulator, at)
     return look(simulator)
-
-
-class Geodesic:
-    """Metres of the shortest way to a goal in the open scene.
-
-    The straight line counts where it is free, else ways over a grid of places 0.2 m apart with their diagonals, which
-    are up to 8 % longer than the shortest ones.
-
-    Args:
-        simulator: has an open scene, in which only the agent moves.
-        goal: on the ground, metres.
-    """
-
-    def __init__(self, simulator: Simulator, goal: Ground) -> None:
-        self._simulator, self._goal = simulator, goal
-        self._grid = FreeGrid(simulator)
-        self._distances = self._grid.distances(goal)
-
-    def metres(self, ground: Ground) -> float:
-        """Return the metres from a place; where no way of the grid leads away from it, by the nearest way of all."""
-        straight = math.dist(ground, self._goal)
-        parts = max(1, math.ceil(straight / FINE))
-        (x, z), (to_x, to_z) = ground, self._goal
-        ways = [(x + n / parts * (to_x - x), z + n / parts * (to_z - z)) for n in range(parts + 1)]
-        if all(map(self._simulator.is_free, ways)):
-            return straight
-        return self._grid.metres(ground, self._distances)
 
 
 class TrueScene:

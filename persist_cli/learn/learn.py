@@ -42,7 +42,7 @@ from persist_cli.output.console import add_task, print_json, print_table, progre
 from persist_cli.output.curve import Curve, draw_curves
 from persist_cli.planning.true_futures import open_again
 from persist_cli.plugins import load_plugin, make_policy, make_settings
-from persist_cli.policies.open_policy import acting_settings, open_policy
+from persist_cli.policies.open_policy import acting_settings, open_trained
 from persist_cli.policies.trained import TrainedPolicy, find_policy, packaged_policy
 from persist_cli.recipe import apply_overrides, make_recipe
 from persist_cli.rollout.open_world import WorldOptions, assemble_world
@@ -175,11 +175,7 @@ def prepare(plan: LearnPlan, out: Path) -> Learning:
     if not 0 <= plan.stop_cost < math.inf:
         raise PersistError(f"--stop-cost {plan.stop_cost:g}: give a finite number of at least 0")
     if plan.inside == SIMULATOR and plan.body is False:
-        raise PersistError(
-            f"--no-body: nobody goes through the walls of the true house; leave out --inside {SIMULATOR}"
-        )
-    if plan.inside == SIMULATOR and plan.adapter is not None:
-        raise PersistError(f"--adapter {plan.adapter}: the true house needs no memory; leave out --inside {SIMULATOR}")
+        raise PersistError("--no-body: nobody goes through walls of the true house; leave out --inside simulator")
     begin = packaged_policy() if plan.policy is None else find_policy(Path(plan.policy))
     sources = find_sources(list(plan.views))
     common_reference(sources)
@@ -191,10 +187,18 @@ def prepare(plan: LearnPlan, out: Path) -> Learning:
         stop_rule(plan.stop_cost)  # weights that are missing are an error before anything is done
         check_held_out(plan, begin, info.scene)
     check_horizon(plan, begin)
-    make_recipe(apply_overrides(recipe_of_round(plan, begin, 1), plan.training), "--set")
+    check_training(plan, begin)
     learning = Learning(plan=plan, out=out, info=info, views=views, begin=begin, simulator=simulator, episodes=episodes)
     check_plan(learning)
     return learning
+
+
+def check_training(plan: LearnPlan, begin: TrainedPolicy) -> None:
+    """Raise ``PersistError`` when the settings of the training are none, or change what is trained."""
+    for text in plan.training:
+        if not text.startswith(("training.", "data.")):
+            raise PersistError(f"--set {text}: a round keeps its policy; set training.* and data.* alone")
+    make_recipe(apply_overrides(recipe_of_round(plan, begin, 1), plan.training), "--set")
 
 
 def identity(learning: Learning) -> dict[str, Any]:
@@ -337,7 +341,7 @@ def counts_of(learning: Learning, number: int) -> dict[str, int]:
 def walk(learning: Learning, place: PracticePlace, number: int) -> None:
     """Practise with the policy of the round before, and write its walks as a data set; batches that are done count."""
     trained = learning.policy(number - 1)
-    policies = open_policy(str(trained.folder)), make_policy("random", {})
+    policies = open_trained(trained), make_policy("random", {})
     settings, folder = learning.plan.practice, learning.folder(number) / "walks"
     seed, counts = learning.plan.seed * 1000 + number, counts_of(learning, number)
     info = info_of_walks(learning.info, place)
@@ -387,7 +391,7 @@ def evaluate(learning: Learning, number: int) -> None:
     if not learning.episodes or "start_metres" in kept.get("figures", ()):
         return
     assert learning.simulator is not None
-    policy, stop = open_policy(str(learning.policy(number).folder)), stop_rule(learning.plan.stop_cost)
+    policy, stop = open_trained(learning.policy(number)), stop_rule(learning.plan.stop_cost)
     records = [] if "figures" in kept else kept.get("episodes", [])
     rest = learning.episodes[len(records) :]
     for record in evaluate_policy(policy, learning.simulator, rest, stop, learning.plan.loop):

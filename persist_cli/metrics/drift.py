@@ -36,10 +36,11 @@ class Drift(DepthMetric):
         """The drift of each frame in metres, NaN without any true depth."""
         truth = in_own_frame(prediction.truth)
         known = on_grid(truth.depth, PROBE_GRID) > 0
-        if not bool(known.any()):
+        there = fuse(truth)
+        if not bool(known.any()) or not len(there):
             return torch.full((len(truth),), math.nan, dtype=torch.float64)
         points = on_grid(unproject(prediction.depth.cpu(), truth.cameras), PROBE_GRID)
-        tree = _tree(fuse(truth))
+        tree = _tree(there)
         return torch.stack([_mean_distance(tree, frame[mask]) for frame, mask in zip(points, known, strict=True)])
 
 
@@ -62,6 +63,8 @@ def fuse(observations: Observations) -> Float[Tensor, "point 3"]:
     """Return the world points of all frames, fused to one for each voxel: the mean of the points in it."""
     depth = on_grid(observations.depth, TRUE_GRID)
     points = on_grid(unproject(observations.depth, observations.cameras), TRUE_GRID)[depth > 0]
+    if not len(points):
+        return points
     cells = (points / VOXEL).floor().long()
     cells -= cells.amin(0)
     _, rows, layers = (cells.amax(0) + 1).tolist()

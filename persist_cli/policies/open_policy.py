@@ -10,7 +10,7 @@ from typing import Any
 from persist_cli.api.policy import Policy
 from persist_cli.errors import PersistError, PluginError, hint
 from persist_cli.plugins import list_plugins, make_policy
-from persist_cli.policies.trained import find_policy
+from persist_cli.policies.trained import TrainedPolicy, find_policy
 
 
 def open_policy(text: str, settings: Mapping[str, Any] | None = None) -> Policy:
@@ -31,10 +31,14 @@ def open_policy(text: str, settings: Mapping[str, Any] | None = None) -> Policy:
     if Path(text).exists() or len(Path(text).parts) > 1:
         if "checkpoint" in settings:
             raise PersistError(f"{text}: a trained policy; leave out policy.checkpoint, or name its plugin instead")
-        trained = find_policy(Path(text))
-        return make_policy(trained.plugin, {**settings, "checkpoint": str(trained.folder)})
+        return open_trained(find_policy(Path(text)), settings)
     names = sorted({plugin.name for plugin in list_plugins("policy")})
     raise PluginError(f"unknown policy {text!r}; {hint(text, names, 'installed')} (or the folder of a trained one)")
+
+
+def open_trained(trained: TrainedPolicy, settings: Mapping[str, Any] | None = None) -> Policy:
+    """Return a trained policy, wherever it lies, with these plain settings of its plugin."""
+    return make_policy(trained.plugin, {**(settings or {}), "checkpoint": str(trained.folder)})
 
 
 def acting_settings(settings: Any) -> dict[str, Any]:

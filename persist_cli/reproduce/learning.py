@@ -42,9 +42,9 @@ VIEWS: Final = "views"
 
 FIRST: Final = 300  # house of the test split; the options were chosen in the houses 200 to 203
 
-OPTIONS: Final = (
-    "--walks 96 --training-steps 300 --steps 1 --guidance 1 --set training.batch=32 --set training.learning_rate=3e-4"
-)
+OPTIONS: Final = "--walks 96 --training-steps 300 --set training.batch=32 --set training.learning_rate=3e-4"
+
+SAMPLING: Final = "--steps 1 --guidance 1"
 
 CHANGE: Final = "after − before"
 
@@ -65,6 +65,7 @@ class Plan:
         views: given posed frames of each house.
         rounds: of practice and training.
         options: further options of ``persist learn``.
+        sampling: those of imagining, which the simulator has not.
     """
 
     out: Path
@@ -76,6 +77,7 @@ class Plan:
     views: int
     rounds: int
     options: str
+    sampling: str
 
     @property
     def scenes(self) -> str:
@@ -123,7 +125,7 @@ def identity(plan: Plan) -> dict[str, Any]:
     return {
         "model": model_json(plan.model),
         "policy": {"path": plan.policy or "that comes with the package", "fingerprint": policy.fingerprint},
-        "scenes": plan.scenes, "views": plan.views, "options": plan.options,
+        "scenes": plan.scenes, "views": plan.views, "options": plan.options, "sampling": plan.sampling,
     }  # fmt: skip
 
 
@@ -169,10 +171,11 @@ def learning_line(plan: Plan, scene: str, views: str, memory: str) -> str:
     home, out = shlex.quote(str(plan.out)), shlex.quote(str(folder_of(plan, scene, memory)))
     given = shlex.quote(f"{plan.out / VIEWS}#{views}")
     policy = f"--policy {shlex.quote(plan.policy)} " if plan.policy else ""
-    inside = "--inside simulator" if memory == SIMULATOR else f"--adapter {shlex.quote(memory)}"
+    model = f"{shlex.quote(plan.model)} --adapter {shlex.quote(memory)} {plan.sampling}".strip()
+    inside = "--inside simulator" if memory == SIMULATOR else model
     return (
-        f"learn {shlex.quote(plan.model)} --views {given} {policy}{inside} --episodes {home}/{EPISODES} "
-        f"--rounds {plan.rounds} --out {out} {plan.options}"
+        f"learn {inside} --views {given} {policy}--episodes {home}/{EPISODES} --rounds {plan.rounds} --out {out} "
+        f"{plan.options}"
     ).strip()
 
 
@@ -296,13 +299,14 @@ def parse(arguments: Sequence[str]) -> Plan:
     parser.add_argument("--views", type=int, default=32, help="given posed frames of each house")
     parser.add_argument("--rounds", type=int, default=1)
     parser.add_argument("--options", default=OPTIONS, help="further options of persist learn (default: %(default)s)")
+    parser.add_argument("--sampling", default=SAMPLING, help="of what is imagined (default: %(default)s)")
     given = parser.parse_args(arguments)
     memories = [name.strip() for name in given.memories.split(",") if name.strip()]
     if not memories or min(given.houses, given.views, given.rounds) < 1:
         raise PersistError("--memories, --houses, --views and --rounds must be at least one each")
     return Plan(
         out=given.out, model=given.model, policy=given.policy, memories=memories, houses=given.houses,
-        first=given.first, views=given.views, rounds=given.rounds, options=given.options,
+        first=given.first, views=given.views, rounds=given.rounds, options=given.options, sampling=given.sampling,
     )  # fmt: skip
 
 

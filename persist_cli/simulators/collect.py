@@ -118,6 +118,8 @@ class CollectPlan:
         if self.frames < 2:
             raise DataError(f"frames {self.frames}: a trajectory has 2 or more")
         _ = self.generator_seeds, self.image_size
+        if self.depth_sensor == "kinect" and min(self.image_size) < 2:
+            raise DataError(f"size {self.size}: the depth sensor kinect needs at least 2 pixels each way")
         for name, (low, high) in LIMITS.items():
             wanted = Range.parse(f"--{name}", getattr(self, name))
             if not low <= wanted.low <= wanted.high <= high:

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from persist_cli.data.store import Store, TrajectoryFile
+from persist_cli.api.observations import Frame
+from persist_cli.data.store import Store, TrajectoryFile, write_trajectory
 from persist_cli.data.written_scenes import SceneWriter
 from tests.support.cell_houses import FORM, write_cell_houses
 
@@ -28,6 +29,18 @@ def test_a_kept_scene_is_not_taken_for_that_of_frames_of_another_size(tmp_path: 
     for size in (first, 96 - first):
         known = SceneWriter(FORM, kept).scene(files[size], [3]).known
         assert torch.equal(known.classes, SceneWriter(FORM).scene(files[size], [3]).known.classes)
+    assert len(kept) == 2
+
+
+def test_a_kept_scene_is_not_taken_for_that_of_a_file_whose_depth_was_mended(tmp_path: Path) -> None:
+    kept, file = Kept(), house(tmp_path / "data", 32)
+    SceneWriter(FORM, kept).scene(file, [3])
+    seen, info = file.read().observations, file.info
+    frames = zip(seen.rgb.numpy(), seen.depth.numpy() / 2, seen.cameras.world_from_camera.numpy(), strict=True)
+    write_trajectory(file.path, info, [Frame(*frame, action="left") for frame in frames])
+    mended = TrajectoryFile(file.path)
+    known = SceneWriter(FORM, kept).scene(mended, [3]).known
+    assert torch.equal(known.classes, SceneWriter(FORM).scene(mended, [3]).known.classes)
     assert len(kept) == 2
 
 

@@ -13,6 +13,7 @@ from gymnasium.utils.env_checker import check_env
 import persist_cli.environments  # noqa: F401  registers them
 from persist_cli.api.simulator import Stand
 from persist_cli.errors import DataError, PersistError
+from persist_cli.simulators.free_grid import Geodesic
 from tests.support.miniworlds import make_world
 
 NAME = "persist/SimulatedHouse-v0"
@@ -160,7 +161,7 @@ def test_a_vector_of_houses_is_equal_to_single_ones_with_its_seeds():
 def test_a_goal_that_is_reached_begins_the_next_episode_of_a_vector_in_the_same_step():
     near = {"success_radius": 1.4, "goal_distance": [1.5, 2.0]}
     vector, singles = gymnasium.make_vec(NAME, num_envs=2, **HOUSES, **near), [make(**near) for _ in range(2)]
-    vector.reset(seed=5)
+    vector.reset(seed=np.int64(5))
     for number, env in enumerate(singles):
         env.reset(seed=5 + number)
     ends = np.zeros(2, int)
@@ -180,6 +181,19 @@ def test_a_goal_that_is_reached_begins_the_next_episode_of_a_vector_in_the_same_
             assert np.array_equal(seen["rgb"][number], last["rgb"])
         ends += reached
     assert ends.min() > 0
+
+
+def test_the_metres_to_a_goal_are_straight_where_the_way_is_free_as_when_plans_are_measured():
+    env = make()
+    env.reset(seed=1)
+    house = env.unwrapped.scenes.houses[0]
+    goal, free = house._goal, Geodesic(house.simulator, house._goal)
+    for _ in range(40):
+        left = env.step(greedy(env))[4]["distance"]
+        assert left == free.metres(house.simulator.agent[0])
+        if left < 1.2:
+            break
+    assert left == pytest.approx(np.hypot(*np.subtract(goal, house.simulator.agent[0])))
 
 
 def test_the_shortest_way_reaches_the_goal_and_earns_its_length_and_the_bonus():
@@ -206,7 +220,7 @@ def greedy(env: gymnasium.Env) -> int:
         places = [(ground[0] + step * x, ground[1] + step * z) for step in steps]
         if not all(house.simulator.is_free(place) for place in places):
             return np.inf
-        return house._metres(places[-1], house._goal, house._distances)
+        return house._geodesic.metres(places[-1])
 
     best = min(range(-12, 12), key=lambda turns: (round(gain(turns), 3), abs(turns)))
     return 0 if best == 0 else 1 if best > 0 else 2

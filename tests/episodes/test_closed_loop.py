@@ -68,6 +68,16 @@ def test_an_approach_compares_all_its_ways_whatever_a_decision_may_imagine(scene
     assert bounded["actions"] == whole["actions"] != ""
 
 
+def test_an_approach_is_compared_with_no_older_one(scene: TrueScene) -> None:
+    scene.back_to_start()
+    navigator = Navigator(RANKED, RowParts(make_policy("random", {}), COST), PlanSettings(), scene, 8)
+    way = navigator.approach().actions
+    assert way
+    assert navigator.approach().actions == ()  # the view is no better than before
+    navigator.decide()  # the goal was not recognised meanwhile
+    assert navigator.approach().actions == way
+
+
 def test_an_agent_that_explores_does_not_plan_to_look_again_from_where_it_has_looked(scene: TrueScene) -> None:
     views = []
     for explore in (False, True):

@@ -16,8 +16,9 @@ from persist_cli.episodes.episodes import SIGHT_SHARE, Episode, EpisodeSet, read
 from persist_cli.episodes.find_episodes import NEAREST_GOAL, find_episodes
 from persist_cli.episodes.navigation_metrics import SUCCESS_METRES
 from persist_cli.episodes.shortest_actions import ShortestActions
-from persist_cli.episodes.true_scene import Geodesic, TrueScene
+from persist_cli.episodes.true_scene import TrueScene
 from persist_cli.errors import DataError
+from persist_cli.simulators.free_grid import Geodesic
 from persist_cli.simulators.miniworld import MiniWorld
 from persist_cli.simulators.way_back import Pose
 from tests.conftest import Persist
@@ -191,6 +192,7 @@ def test_the_command_writes_episodes_that_can_be_read(persist: Persist, tmp_path
         (("--scenes", "5:5"), "write A:B with A less than B"),
         (("--simulator", "miniwrld"), "did you mean 'miniworld'"),
         (("--split", "held-out"), "unknown split"),
+        (("--turn", "50"), "turns of 50° never make a full circle; take a whole part of 360°"),
         (("--turn", "0"), "--turn '0.0': it must lie between 0.1 and 180"),
         (("--fov", "200"), "fov"),
         (("--goals", "seen"), "unknown --goals 'seen'; known: both, in-sight, hidden"),

@@ -208,15 +208,29 @@ def test_how_episodes_are_run_is_refused_without_episodes(learn, tmp_path):
 @pytest.mark.parametrize(
     ("options", "cause"),
     [
-        (("--no-body",), "--no-body: nobody goes through the walls of the true house; leave out --inside simulator"),
-        (("--adapter", "none"), "--adapter none: the true house needs no memory; leave out --inside simulator"),
+        ([], "{walks}#0:0-12: of no simulator; leave --episodes and --inside simulator out"),
+        (["--no-body"], "--no-body: nobody goes through walls of the true house; leave out --inside simulator"),
+        (
+            ["reference", "--adapter", "none", "--steps", "1", "--dtype", "float32"],
+            "checkpoint, --adapter, --steps, --dtype: the true house needs no model and no memory; "
+            "leave out --inside simulator",
+        ),
     ],
 )
-def test_what_the_true_house_has_no_use_for_is_refused(learn, tmp_path, options, cause):
-    result = learn("out", "--inside", "simulator", *options)
-    assert (result.code, result.err.count("\n")) == (1, 1)
-    assert cause in result.err
+def test_what_the_true_house_has_no_use_for_is_refused(persist, walks, policy_run, tmp_path, options, cause):
+    given = ["--views", f"{walks}#0:0-12", "--policy", policy_run, "--out", tmp_path / "out", "--inside", "simulator"]
+    result = persist("learn", *options, *given)
+    assert (result.code, result.err) == (1, f"error: {cause.format(walks=walks)}\n")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_policy_in_a_folder_called_like_a_plugin_is_the_one_that_practises(learn, policy_run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(find_policy(policy_run).folder, "nomad")
+    assert [learn(out, *given).code for out, given in (("one", ()), ("two", ("--policy", "./nomad")))] == [0, 0]
+    one, two = (Store(tmp_path / out / "round-01" / "walks") for out in ("one", "two"))
+    assert [file.actions() for file in one] == [file.actions() for file in two]
+    assert all(torch.equal(mine.poses(), theirs.poses()) for mine, theirs in zip(one, two, strict=True))
 
 
 def test_a_learning_that_was_stopped_ends_as_one_that_was_not(learn, tmp_path):
@@ -308,11 +322,12 @@ def test_walks_are_imagined_in_the_precision_that_is_asked_for(walks, voxel, pol
     [
         ("--dtype", "bfloat61", "unknown --dtype 'bfloat61'; did you mean 'bfloat16'?"),
         ("--inside", "dream", "a policy practises inside the model or the simulator"),
-        ("--inside", "simulator", "of no simulator; leave --episodes and --inside simulator out"),
         ("--policy", "nowhere/policy", "no trained policy there"),
         ("--adapter", "voxle", "no memory adapter 'voxle' in it; it has voxel"),
         ("--sampler", "dim", "unknown sampler 'dim'"),
         ("--autoguidance", "3", "autoguidance of 3: this checkpoint has no guide"),
+        ("--set", "policy.settings.channels=[8, 8]", "a round keeps its policy; set training.* and data.* alone"),
+        ("--set", "base=elsewhere", "a round keeps its policy; set training.* and data.* alone"),
         ("--set", "training.bach=3", "--set: unknown key 'training.bach', did you mean 'training.batch'?"),
         (
             "--actions",

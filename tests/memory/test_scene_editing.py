@@ -128,6 +128,13 @@ def observed_scene() -> GridScene:
     return scene
 
 
+def test_a_scene_whose_model_is_gone_can_still_be_painted():
+    scene = empty_scene(model="nowhere/scene")
+    scene.add(cell_room())
+    assert scene.imagines
+    assert scene.edit([Paint(**EVERYWHERE, color=(1, 2, 3))]).changed
+
+
 def test_an_edit_with_a_model_leaves_every_observed_cell_with_its_votes_and_its_class():
     scene, before = observed_scene(), observed_scene()
     box = find_things(scene.cells)[-1].box
@@ -216,6 +223,15 @@ def with_box_on_table() -> CellGrid:
     grid = cell_room()
     grid.classes[4, 7, 4], grid.colors[4, 7, 4] = BOX, torch.tensor((7, 7, 7), dtype=torch.uint8)
     return grid
+
+
+@pytest.mark.parametrize("edit", [Move, Copy])
+def test_what_lies_in_the_floor_is_not_moved(edit):
+    grid = cell_room()
+    grid.classes[9, 9, 0] = BOX
+    box = next(thing.box for thing in find_things(grid) if thing.cells[0].tolist() == [9, 9, 0])
+    with pytest.raises(DataError, match="what is there lies in the floor"):
+        edited(grid, edit(low=box.low, high=box.high, by=(0.5, 0.0, 0.0)))
 
 
 def test_what_stands_on_a_moved_thing_goes_along():

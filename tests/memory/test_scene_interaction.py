@@ -69,6 +69,26 @@ def test_nothing_is_put_down_into_a_wall():
     assert do(scene, "drop", ((7, 9, 5), (9, 9, 5)))
 
 
+def test_nothing_is_put_down_behind_a_wall():
+    scene, grid = furnished(), cell_room()
+    grid.classes[8, :, :] = WALL
+    assert do(scene, "pick_up")
+    scene.add(grid)
+    before = classes(scene)
+    assert not do(scene, "drop", ((7, 9, 5), (12, 9, 5)))
+    assert torch.equal(classes(scene), before)
+
+
+@pytest.mark.parametrize(("below", "above"), [("box", "barrel"), ("barrel", "box")])
+def test_of_a_pile_the_thing_on_top_is_picked_up(below, above):
+    scene, grid = furnished(), cell_room()
+    lower, upper = (FORM.palette.index(name) for name in (below, above))
+    grid.classes[9, 4, 1:3] = torch.tensor([lower, upper], dtype=torch.uint8)
+    scene.add(grid)
+    assert do(scene, "pick_up")
+    assert classes(scene)[9, 4, :4].tolist() == [FLOOR, lower, FREE, FREE]
+
+
 def test_toggling_turns_the_colour_of_a_box_into_its_complement_and_back():
     scene = furnished()
     color = cell_room().colors[BOX_CELLS]

@@ -32,6 +32,13 @@ def test_a_wall_that_moves_away_drifts_by_as_much(shift):
     assert drift_of_a_wall(shift).tolist() == pytest.approx([abs(shift)] * 2, rel=0.03)
 
 
+def test_where_no_true_depth_is_sampled_there_is_no_drift():
+    truth = observe_room(walk(2), Room(512, 512))  # of which 256 rows are fused and 64 others measured
+    sparse = torch.zeros_like(truth.depth)
+    sparse[:, 4::8, 4::8] = 1.0
+    assert DRIFT.measure(prediction(truth.rgb, truth.depth, replace(truth, depth=sparse))).isnan().all()
+
+
 def test_one_wrong_frame_does_not_change_the_figures_of_others():
     truth = observe_room(walk(6))
     wrong = truth.depth.clone()

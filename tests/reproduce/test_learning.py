@@ -39,7 +39,7 @@ MEMORIES = ("voxel", "none", "simulator")
 def plan(voxel: Path, policy_run: Path, tmp_path: Path) -> Plan:
     return Plan(
         out=tmp_path / "my runs", model=str(voxel), policy=str(policy_run), memories=MEMORIES, houses=6, first=0,
-        views=32, rounds=1, options="--walks 4",
+        views=32, rounds=1, options="--walks 4", sampling="--steps 1",
     )  # fmt: skip
 
 

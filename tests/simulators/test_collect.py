@@ -206,6 +206,7 @@ def test_a_folder_of_trajectories_that_were_not_collected_is_refused(tmp_path: P
         {"turn": "5:270"},
         {"tint": "-0.5:0"},
         {"depth_sensor": "lidar"},
+        {"depth_sensor": "kinect", "size": "1x16"},
     ],
 )
 def test_bad_options_are_reported_in_one_line_and_write_nothing(tmp_path: Path, change: dict[str, object]) -> None:

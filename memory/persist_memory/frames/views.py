@@ -19,7 +19,7 @@ from persist_cli.api.geometry import unproject
 from persist_cli.api.memory import Memory
 from persist_cli.api.observations import Origin
 from persist_memory.frames.frame_memory import FrameMemory, FrameSettings, FrameStore, frame_stores
-from persist_memory.snapshots.cover import greedy_cover, locate
+from persist_memory.snapshots.cover import greedy_cover, locate, nearest_distances
 from persist_memory.validation import check_mergeable
 
 POINTS = 4  # along each side of an image
@@ -57,7 +57,7 @@ class ViewsMemory(FrameMemory):
     def choose(self, store: FrameStore, cameras: Cameras, count: int) -> Int64[Tensor, " chosen"]:
         """Return the images that together cover most of the view, the nearest of equally good ones first."""
         covered = in_field_of_view(view_points(cameras).flatten(0, 1), store.cameras)
-        distances = torch.cdist(store.cameras.centers, cameras.centers.double()).amin(1)
+        distances = nearest_distances(store.cameras.centers, cameras.centers)
         return torch.tensor(greedy_cover(covered, distances, count), dtype=torch.int64, device=covered.device)
 
     def merge(self, other: Memory) -> None:

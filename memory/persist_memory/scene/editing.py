@@ -232,6 +232,8 @@ def _carry(grid: CellGrid, edit: Move | Copy) -> Cells:
     places = targets.nonzero()
     if floor is not None:
         places = places[places[:, 2] != floor]
+    if not len(places):
+        raise DataError("what is there lies in the floor")
     classes, colors = grid.classes[tuple(places.T)].clone(), grid.colors[tuple(places.T)].clone()
     uncovered = _remove(grid, targets) if isinstance(edit, Move) else torch.zeros_like(targets)
     _check_room(grid, places + shift, edit.overwrite)

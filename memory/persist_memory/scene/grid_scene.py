@@ -245,10 +245,9 @@ class GridScene(Scene):
         before = self.cells.box(self.cells.corner, self.cells.shape)
         imagine = None
         if self.imagines:
-            imagination = self._imagination()
 
             def imagine(grid: CellGrid, hidden: Bool[Tensor, "first second level"]) -> CellGrid:
-                return imagine_hidden(imagination, grid, hidden, seed)
+                return imagine_hidden(self._imagination(), grid, hidden, seed)
 
         after, outcome = edit_grid(before, edits, imagine)
         self._change(after, before)

@@ -15,6 +15,7 @@ from persist_cli.api.cells import FREE, CellGrid, CellOrigin
 from persist_cli.api.ground import Body
 from persist_cli.api.reach import AHEAD, CHANGED, REACH, place_and_heading
 from persist_cli.errors import CheckpointError
+from persist_memory.scene.support import standing_on
 from persist_memory.scene.surroundings import fill_from_surroundings
 from persist_memory.validation import Shape, check_classes, part_of
 
@@ -96,7 +97,7 @@ class Reached:
     largest: float
 
     def thing(self) -> Thing | None:
-        """Return the nearest thing ahead that is small enough to be carried and has nothing before it."""
+        """Return the nearest thing ahead that is small enough to be carried, with nothing before or on it."""
         place, ahead = place_and_heading(self.world_from_camera, self.grid.axes)
         size, near = self.grid.form.size, []
         for thing in find_things(self.grid):
@@ -106,7 +107,7 @@ class Reached:
             offset = self._middle(thing.cells) - place
             distance, radius = float(offset.norm()), float(span[:2].max()) / 2
             if distance < REACH + radius and float(offset @ ahead) > AHEAD * distance and self._in_sight(thing, offset):
-                near.append((distance, thing.name, thing))
+                near += [] if self._holds_another(thing) else [(distance, thing.name, thing)]
         return min(near, key=lambda one: one[:2])[2] if near else None
 
     def pick_up(self) -> Load | None:
@@ -133,7 +134,7 @@ class Reached:
         if bool(((cells < 0) | (cells >= torch.tensor(self.grid.shape))).any()):
             return False
         where = tuple(cells.unbind(1))
-        if bool(self.grid.solid[where].any()):
+        if bool(self.grid.solid[where].any()) or not self._free_way(self.grid.solid, at - place, cells[:, 2].unique()):
             return False
         self.grid.classes[where], self.grid.colors[where] = load.classes, load.colors
         self.grid.origins[where] = CellOrigin.IMAGINED
@@ -156,13 +157,25 @@ class Reached:
 
     def _in_sight(self, thing: Thing, offset: Float[Tensor, " 2"]) -> bool:
         """Whether no other solid cell at the thing's own height lies on the straight way to its middle."""
-        size, levels = self.grid.form.size, thing.cells[:, 2]
         solid = self.grid.solid.clone()
         solid[tuple(thing.cells.unbind(1))] = False
+        return self._free_way(solid, offset, thing.cells[:, 2].amax()[None])
+
+    def _free_way(
+        self, solid: Bool[Tensor, "first second level"], offset: Float[Tensor, " 2"], levels: Int64[Tensor, " level"]
+    ) -> bool:
+        """Whether the straight way from the agent to an offset on the ground is free at some levels."""
         place, _ = place_and_heading(self.world_from_camera, self.grid.axes)
+        size = self.grid.form.size
         shares = torch.linspace(0, 1, math.ceil(2 * float(offset.norm()) / size) + 2, dtype=torch.float64)
         cells = ((place + shares[:, None] * offset) / size).round().long() - torch.tensor(self.grid.corner[:2])
-        return not bool(solid[cells[:, 0], cells[:, 1], int(levels.amax())].any())
+        return not bool(solid[cells[:, 0], cells[:, 1]][:, levels].any())
+
+    def _holds_another(self, thing: Thing) -> bool:
+        """Whether something stands on a thing and on nothing else."""
+        own = torch.zeros_like(self.grid.solid)
+        own[tuple(thing.cells.unbind(1))] = True
+        return bool(standing_on(self.grid, own))
 
     def _uncover(self, cells: Int64[Tensor, "cell 3"]) -> None:
         """Let the floor go on where a thing stood on cells that nobody saw."""

@@ -88,6 +88,13 @@ def covered_view(
     return covered.scatter_(1, place.flatten(1), True)[:, :places]
 
 
+def nearest_distances(
+    places: Float[Tensor, "snapshot 3"], centers: Float[Tensor, "view 3"]
+) -> Float[Tensor, " snapshot"]:
+    """Metres from each place to the nearest of some camera centres, exact at any distance from the world's origin."""
+    return torch.cdist(places, centers.double(), compute_mode="donot_use_mm_for_euclid_dist").amin(1)
+
+
 def greedy_cover(
     covered: Bool[Tensor, "snapshot place"], distances: Float[Tensor, " snapshot"], count: int
 ) -> list[int]:

@@ -24,7 +24,7 @@ from persist_cli.errors import CheckpointError
 from persist_memory.batched_reads import distinct_cameras, same_size
 from persist_memory.detail import feature_across, pixels_across
 from persist_memory.snapshots.album import Album
-from persist_memory.snapshots.cover import covered_view, greedy_cover, without_observed
+from persist_memory.snapshots.cover import covered_view, greedy_cover, nearest_distances, without_observed
 from persist_memory.snapshots.snapshot_store import SnapshotStore
 from persist_memory.validation import (
     ORIGINS,
@@ -191,12 +191,11 @@ class Snapshots(Memory):
         self, store: SnapshotStore, covered: Bool[Tensor, "snapshot place"], cameras: Cameras, budget: int
     ) -> MemoryTokens:
         """Tokens of the snapshots that cover most places in view of the cameras."""
-        centers = cameras.centers.double()
-        distances = torch.cdist(store.world_from_camera[:, :3, 3], centers).amin(1)
+        distances = nearest_distances(store.world_from_camera[:, :3, 3], cameras.centers)
         numbers = torch.tensor(greedy_cover(covered, distances, self.settings.count), dtype=torch.int64)
-        chosen = store[numbers.to(centers.device)]
+        chosen = store[numbers.to(cameras.centers.device)]
         placed = chosen.depth > 0
-        origins = self._origins(store)[numbers.to(centers.device)][:, None].expand_as(placed)
+        origins = self._origins(store)[numbers.to(cameras.centers.device)][:, None].expand_as(placed)
         parts = (chosen.features, chosen.points, chosen.colors, origins, chosen.depth)
         return MemoryTokens.of(*(part[placed][:budget] for part in parts))
 

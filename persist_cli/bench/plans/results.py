@@ -211,9 +211,9 @@ def define(row: PlanningRow, bench: PlanningBench) -> str:
         model += ", which remembers nothing of the walk"
     how = f"ranks {row.candidates} proposals of {row.policy!r}"
     if row.searches:
-        rounds = bench.plan.planning.cem.rounds
-        how = f"cross-entropy method, {row.candidates} candidates a round, at most {rounds} rounds"
-        how += f", the first of them half of {row.policy!r}" if row.policy is not None else ""
+        cem = bench.plan.planning.cem
+        how = f"cross-entropy method, {row.candidates} candidates a round, at most {cem.rounds} rounds"
+        how += f", {cem.proposed:.0%} of the first proposed by {row.policy!r}" if row.policy is not None else ""
     return f"{how} by {bench.cost.name}; {model}; {told}"
 
 
