@@ -145,7 +145,7 @@ class Recipe:
 
 USUAL: Final = {  # names where a recipe has none
     "backbone.name": BackboneConfig.name, "memory.name": MemoryConfig.name, "memory.encoder": MemoryConfig.encoder,
-    "policy.name": PolicyConfig.name, "scene.name": SceneConfig.name,
+    "policy.name": PolicyConfig.name, "scene.name": SceneConfig.name, "adapter.form": "cross",
 }  # fmt: skip
 
 
@@ -318,7 +318,7 @@ def make_recipe(values: Mapping[str, Any], where: str) -> Recipe:
 
 def _contradictions(recipe: Recipe) -> list[str]:
     """Describe each group of settings that are valid alone but not together."""
-    training, problems = recipe.training, [*_of_a_network(recipe), *_of_data(recipe)]
+    training, problems = recipe.training, [*_of_a_network(recipe), *_of_the_codec(recipe), *_of_data(recipe)]
     if training.cooldown > training.steps:
         problems.append(
             f"training.cooldown {training.cooldown} is more than training.steps {training.steps}; set both, as in "
@@ -342,6 +342,13 @@ def _contradictions(recipe: Recipe) -> list[str]:
     if training.batch % training.accumulation:
         problems.append(f"training.batch {training.batch} must be a multiple of accumulation {training.accumulation}")
     return problems
+
+
+def _of_the_codec(recipe: Recipe) -> list[str]:
+    """Describe settings that mean nothing to the codec's stage."""
+    names = ("gradient_checkpointing", "compile") if recipe.stage == "codec" else ()
+    unused = " and ".join(f"training.{name}" for name in names if getattr(recipe.training, name))
+    return [f"{unused}: of the video model, which stage codec does not train; leave it out"] if unused else []
 
 
 def _of_data(recipe: Recipe) -> list[str]:

@@ -147,6 +147,15 @@ def test_recipes_in_two_folders_that_extend_each_other_are_named(tmp_path):
         read_recipe(str(tmp_path / "a/x.yaml"))
 
 
+def test_the_form_of_an_adapter_is_cross_where_a_recipe_names_none(tmp_path):
+    base = "cogvideox-5b-i2v-stage2-voxel"
+    (tmp_path / "a.yaml").write_text(f"extends: {base}\nadapter: {{form: cross, heads: 8}}\n")
+    kept = read_recipe(base)["adapter"]
+    assert "form" not in kept
+    assert read_recipe(str(tmp_path / "a.yaml"))["adapter"] == kept | {"form": "cross", "heads": 8}
+    assert apply_overrides(read_recipe(base), ["adapter.form=rendered"])["adapter"] == {"form": "rendered"}
+
+
 def test_a_recipe_changes_one_setting_of_the_backbone_and_inherits_the_others(tmp_path):
     (tmp_path / "a.yaml").write_text(
         "extends: cogvideox-5b-i2v-stage1\nbackbone: {settings: {pretrained: DIR, transformer: {num_layers: 2}}}\n"

@@ -68,6 +68,7 @@ class Backbone(nn.Module, ABC):
     sharded_blocks: ClassVar[tuple[str, ...]] = ()  # class names of blocks that a sharded model gathers one by one
     never_sharded: ClassVar[tuple[str, ...]] = ()  # submodules that work outside of ``forward`` and are never sharded
     built_by: ClassVar[tuple[str, ...]] = ()  # settings that say how it is built, which a base has its own of
+    of_weights: ClassVar[tuple[str, ...]] = ()  # settings of a checkpoint's video model that a fresh one has not
     video_model: ClassVar[tuple[str, ...]] = ()  # files and folders of ``save_base`` that an export keeps of a guide
     for_training: ClassVar[tuple[str, ...]] = ()  # settings of losses, in which a guide may differ from its model
     name: str = ""  # set by the registry

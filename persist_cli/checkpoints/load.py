@@ -214,6 +214,10 @@ def start_backbone(recipe: Recipe, base: Checkpoint | None) -> Backbone:
         if recipe.memory is not None:
             check_frozen(config, base)
         return load_backbone(base, config.settings)
+    if "pretrained" in changed:
+        raise RecipeError(
+            f"backbone.settings.pretrained: base {base.folder} has a video model of its own; leave one of the two out"
+        )
     if not is_own_codec(base):
         raise RecipeError(
             f"backbone.settings.{changed[0]}: base {base.folder} is a model that was built with another; leave it out"
@@ -251,7 +255,9 @@ def fresh_on_codec(checkpoint: Checkpoint, settings: Mapping[str, Any]) -> Backb
     from persist_cli.plugins import make_backbone
 
     checkpoint.check_weights(None)
-    backbone = make_backbone(checkpoint.backbone, merge_settings(checkpoint.settings, settings))
+    of_weights = load_plugin("backbone", checkpoint.backbone).of_weights
+    own = {name: value for name, value in checkpoint.settings.items() if name not in of_weights}
+    backbone = make_backbone(checkpoint.backbone, merge_settings(own, settings))
     backbone.load_codec(checkpoint.base_folder)
     return backbone
 

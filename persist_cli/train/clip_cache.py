@@ -74,7 +74,7 @@ class CacheKeys:
     hashes: dict[Path, str] = field(default_factory=dict)  # of the trajectories' files, each computed once
 
     @staticmethod
-    def of(recipe: Recipe, backbone: Backbone, factory: MemoryFactory | None, device: str) -> CacheKeys:
+    def of(recipe: Recipe, backbone: Backbone, factory: MemoryFactory | None, device: str, precision: str) -> CacheKeys:
         """The keys of a run.
 
         Args:
@@ -82,14 +82,15 @@ class CacheKeys:
             backbone: the backbone, which encodes clips and decides on the number of tokens and the size of images.
             factory: makes the memories, ``None`` without one.
             device: the type of the device that encodes.
+            precision: in which it encodes: accelerate's, which is ``no`` for DeepSpeed whatever the recipe's.
         """
         encoded_by = {"persist": __version__, "torch": torch.__version__, "device": device}
-        latents = encoded_by | {"encoding": backbone.encoding(), "precision": recipe.training.precision}
+        latents = encoded_by | {"encoding": backbone.encoding(), "precision": precision}
         tokens = None
         if factory is not None and recipe.memory is not None:
             tokens = encoded_by | _token_dependencies(recipe.memory, factory, backbone)
             if kept := backbone.token_encoding():
-                tokens |= {"kept": kept, "precision": recipe.training.precision}
+                tokens |= {"kept": kept, "precision": precision}
             if noise := WritingNoise.of(recipe.data):
                 tokens |= {"noise": dataclasses.asdict(noise)}
         return CacheKeys(

@@ -156,7 +156,8 @@ class Trainer(TrainingLoop[Backbone]):
                 "--cache: with data.crop, data.mirror or data.color_jitter no view of a clip comes twice; give "
                 "data.clips_per_trajectory, as in data.clips_per_trajectory=32, or leave --cache out"
             )
-        keys = CacheKeys.of(recipe, backbone, self.factory, self.accelerator.device.type)
+        device, precision = self.accelerator.device.type, self.accelerator.mixed_precision
+        keys = CacheKeys.of(recipe, backbone, self.factory, device, precision)
         kept = ClipCache.of(TensorCache(settings), keys, self.factory)
         return ClipEncoder(backbone, self.factory, self.accelerator, kept)
 

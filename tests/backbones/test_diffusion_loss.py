@@ -89,6 +89,26 @@ def test_weights_trained_for_another_prediction_are_refused(tmp_path: Path) -> N
         micro(prediction="v_prediction", pretrained=str(tmp_path), prompt=None)
 
 
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        (
+            {"transformer": {"num_layers": 5}},
+            r"backbone.settings.transformer.num_layers: .* has 2, not 5; leave it out",
+        ),
+        ({"vae": {"scaling_factor": 3.0}}, r"backbone.settings.vae.scaling_factor: .* not 3.0; leave it out"),
+    ],
+)
+def test_pretrained_weights_keep_their_own_sizes(
+    tmp_path: Path, change: dict[str, dict[str, float]], cause: str
+) -> None:
+    micro().save_base(tmp_path)
+    with pytest.raises(CheckpointError, match=cause):
+        micro(pretrained=str(tmp_path), prompt=None, **change)
+    with pytest.raises(CheckpointError, match=cause), torch.device("meta"):
+        micro(pretrained=str(tmp_path), prompt=None, **change)
+
+
 def test_a_scheduler_that_predicts_noise_is_refused(tmp_path: Path) -> None:
     micro().save_base(tmp_path)
     config = tmp_path / "scheduler" / "scheduler_config.json"

@@ -93,6 +93,13 @@ def test_an_emptied_memory_is_no_memory() -> None:
     assert torch.allclose(predicted_of(backbone, clips, memory.emptied()), predicted(backbone, clips, None), atol=1e-5)
 
 
+def test_without_frames_every_parameter_has_a_gradient_too_as_processes_that_train_together_need() -> None:
+    backbone = with_adapter(micro(), form="frames", learned_tokens=2)
+    backbone(random_clips(), "2")["loss"].backward()
+    missing = [name for name, parameter in backbone.trained_parameters("2").items() if parameter.grad is None]
+    assert missing == []
+
+
 def test_every_parameter_has_a_gradient_within_two_steps() -> None:
     backbone = with_adapter(micro(), form="frames", learned_tokens=2)
     shaken(backbone.transformer)

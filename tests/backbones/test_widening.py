@@ -59,6 +59,10 @@ def test_a_missing_or_truncated_part_is_refused(plain_folder, part):
     ("change", "cause"),
     [({"height": 30}, "multiple of 8"), ({"frames": 13}, r"8n \+ 1"), ({"frames": 1}, r"8n \+ 1, at least 2"),
      ({"codec_window": (5, 8, 8)}, "codec_window"), ({"transformer": {"in_channels": 6}}, "does not fit a VAE"),
+     ({"codec_window": (9, 30, 32)}, r"codec_window \[9, 30, 32\]: height and width must be multiples of"),
+     ({"vae": {"latent_channels": 4}, "transformer": {"in_channels": 8}}, "give transformer.out_channels=4"),
+     ({"transformer": {"attention_head_dim": 30, "use_rotary_positional_embeddings": True}}, "need a multiple of 16"),
+     ({"transformer": {"activation_fn": "foo"}}, "diffusers cannot make a transformer of these settings"),
      ({"transformer": {"patch_size_t": 2}}, "patch_size_t needs rotary positions alone"),
      ({"transformer": {"ofs_embed_dim": 8}}, "ofs_embed_dim 8 is not its time_embed_dim 256")],
 )  # fmt: skip

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 
+from persist_cli.api.checkpoint import find_checkpoint
+from persist_cli.checkpoints.load import fresh_on_codec
 from tests.support.micro_runs import stage
 
 
@@ -28,3 +32,27 @@ def test_a_codec_alone_is_no_base_of_a_memory_or_lora(persist, walks, codec, tmp
     result = persist(*stage(number, walks, tmp_path / "out", f"base={codec}", *others))
     assert result.code == 1
     assert "a codec alone, whose video model was not trained; train stage 1 on it, and name that" in result.err
+
+
+def test_a_base_and_pretrained_weights_are_not_both_begun_with(persist, walks, stage1, tmp_path):
+    pretrained = f"backbone.settings.pretrained={stage1}"
+    result = persist(*stage("stage1", walks, tmp_path / "out", f"base={stage1}", pretrained))
+    assert result.code == 1
+    assert "has a video model of its own; leave one of the two out" in result.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_fresh_video_model_on_a_codec_has_positions_of_its_own_size(codec):
+    base = find_checkpoint(codec)
+    settings = base.settings | {"rotary_grid": [8, 8]}
+    base = dataclasses.replace(base, settings=settings)
+    changes = {"transformer": {"use_rotary_positional_embeddings": True}}
+    assert fresh_on_codec(base, changes).rotary_grid == (4, 4)
+    assert fresh_on_codec(base, changes | {"rotary_grid": [8, 8]}).rotary_grid == (8, 8)
+
+
+@pytest.mark.parametrize("name", ["gradient_checkpointing", "compile"])
+def test_a_codec_takes_no_savings_of_the_video_model(persist, walks, tmp_path, name):
+    result = persist(*stage("codec", walks, tmp_path / "out", f"training.{name}=true"))
+    assert (result.code, result.err.count("\n")) == (1, 1)
+    assert f"training.{name}: of the video model, which stage codec does not train" in result.err

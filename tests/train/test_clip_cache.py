@@ -176,7 +176,7 @@ def keys_of(walks, voxel):
         recipe = Recipe(stage, memory=memory, data=data, training=TrainingSettings(precision=precision))
         with torch.no_grad():
             next(backbone.codec.parameters()).add_(codec)
-        return CacheKeys.of(recipe, backbone, factory, "cpu").of_clip(frames)
+        return CacheKeys.of(recipe, backbone, factory, "cpu", recipe.training.precision).of_clip(frames)
 
     return of
 

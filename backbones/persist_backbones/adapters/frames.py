@@ -102,8 +102,7 @@ class FramesAdapter(Adapter[PreparedMemory]):
     def prepare(self, tokens: MemoryTokens, cameras: Cameras) -> PreparedMemory:
         """Embed latents, rays and origins of the patches of all frames, and add them."""
         if tokens.latents is None or tokens.world_from_camera is None or tokens.intrinsics is None:
-            nothing = self.embed.weight.new_zeros(len(tokens.mask), 1, self.settings.width)
-            return self.with_learned(PreparedMemory(nothing, tokens.mask.new_zeros(nothing.shape[:2])))
+            return self.with_learned(self.nothing(tokens))
         side, dtype = self.settings.frame_patch, self.embed.weight.dtype
         patches = F.pixel_unshuffle(tokens.latents.to(dtype), side)
         rows, columns = patches.shape[-2:]
@@ -111,6 +110,13 @@ class FramesAdapter(Adapter[PreparedMemory]):
         hidden = hidden + self.origin(tokens.origins.long())[:, :, None, None]
         mask = tokens.mask[:, :, None, None].expand(hidden.shape[:-1])
         return self.with_learned(PreparedMemory((hidden * mask[..., None]).flatten(1, 3), mask.flatten(1, 3)))
+
+    def nothing(self, tokens: MemoryTokens) -> PreparedMemory:
+        """Return one patch that is left out, of which all weights get gradients: DDP waits for each."""
+        weights, count = self.embed.weight, len(tokens.mask)
+        hidden = self.embed(weights.new_zeros(count, 1, self.embed.in_features))
+        hidden = hidden + self.place(weights.new_zeros(count, 1, self.place.in_features)) + self.origin.weight[:1]
+        return PreparedMemory(hidden * 0, tokens.mask.new_zeros(count, 1))
 
     def after(
         self, block: nn.Module, video: Tensor, memory: PreparedMemory, camera: Tensor, time: Tensor

@@ -82,7 +82,8 @@ class CogVideoX(AdaptedBackbone):
     settings_type = CogVideoXSettings
     sharded_blocks = ("CogVideoXBlock", "MemoryBlock", "CanvasBlock")
     never_sharded = ("codec",)
-    built_by = ("transformer", "prediction", "vae")
+    built_by = ("transformer", "prediction", "vae", "pretrained")
+    of_weights = ("rotary_grid",)
     video_model = ("transformer", "world.safetensors")
     for_training = LOSS_SETTINGS
     settings: CogVideoXSettings

@@ -96,10 +96,8 @@ def check_fit(parts: DiffusersParts, settings: CogVideoXSettings) -> None:
     unit = spatial_compression(parts.vae) * config.patch_size
     if settings.height % unit or settings.width % unit:
         raise CheckpointError(f"image size {settings.height}x{settings.width} must be a multiple of {unit}")
-    if config.in_channels not in (vae.latent_channels, 2 * vae.latent_channels):
-        raise CheckpointError(
-            f"a transformer of {config.in_channels} channels does not fit a VAE of {vae.latent_channels}"
-        )
+    check_window(settings.codec_window, spatial_compression(parts.vae))
+    check_channels(config, vae.latent_channels)
     if settings.given == "rendered" and not settings.depth:
         raise CheckpointError("given=rendered moves the given frame by its depth, of which depth=false leaves none")
     if config.ofs_embed_dim and config.ofs_embed_dim != config.time_embed_dim:
@@ -110,6 +108,25 @@ def check_fit(parts: DiffusersParts, settings: CogVideoXSettings) -> None:
     tables = config.use_learned_positional_embeddings or not config.use_rotary_positional_embeddings
     if config.patch_size_t is not None and tables:
         raise CheckpointError("patch_size_t needs rotary positions alone, as CogVideoX 1.5 has them")
+
+
+def check_window(window: tuple[int, int, int] | None, spatial: int) -> None:
+    """Raise ``CheckpointError`` when a codec of this compression cannot code windows of this size."""
+    if window is not None and (window[1] % spatial or window[2] % spatial):
+        raise CheckpointError(f"codec_window {list(window)}: height and width must be multiples of {spatial}")
+
+
+def check_channels(config: Any, latents: int) -> None:
+    """Raise ``CheckpointError`` when a transformer's channels or heads cannot be used with so many latent channels."""
+    if config.in_channels not in (latents, 2 * latents):
+        raise CheckpointError(f"a transformer of {config.in_channels} channels does not fit a VAE of {latents}")
+    if config.out_channels != latents:
+        raise CheckpointError(
+            f"a transformer of {config.out_channels} output channels does not fit a VAE of {latents}; give "
+            f"transformer.out_channels={latents}"
+        )
+    if config.use_rotary_positional_embeddings and config.attention_head_dim % 16:
+        raise CheckpointError(f"attention_head_dim {config.attention_head_dim}: rotary positions need a multiple of 16")
 
 
 def check_prediction(scheduler: CogVideoXDDIMScheduler, wanted: Prediction | None) -> None:

@@ -76,14 +76,26 @@ def starting_parts(settings: CogVideoXSettings) -> DiffusersParts:
     """
     if settings.pretrained is None:
         return make_parts(settings)
-    if not on_meta_device():
-        return load_parts(pretrained_folder(settings.pretrained))
-    folder = folder_here(settings.pretrained)
+    folder = folder_here(settings.pretrained) if on_meta_device() else pretrained_folder(settings.pretrained)
     if folder is not None:
-        return load_parts(folder)
-    check_name(settings.pretrained)
-    preset: Any = published_preset(settings.pretrained) or settings.preset
-    return make_parts(dataclasses.replace(settings, preset=preset))
+        parts = load_parts(folder)
+    else:
+        check_name(settings.pretrained)
+        preset: Any = published_preset(settings.pretrained) or settings.preset
+        parts = make_parts(dataclasses.replace(settings, preset=preset, transformer={}, vae={}))
+    check_own_sizes(parts, settings)
+    return parts
+
+
+def check_own_sizes(parts: DiffusersParts, settings: CogVideoXSettings) -> None:
+    """Raise ``CheckpointError`` when the settings have another size or option than the pretrained weights."""
+    for name, part in (("transformer", parts.transformer), ("vae", parts.vae)):
+        for key, value in getattr(settings, name).items():
+            own = part.config.get(key)
+            if (list(own) if isinstance(own, tuple) else own) != (list(value) if isinstance(value, tuple) else value):
+                raise CheckpointError(
+                    f"backbone.settings.{name}.{key}: {settings.pretrained} has {own!r}, not {value!r}; leave it out"
+                )
 
 
 def make_parts(settings: CogVideoXSettings) -> DiffusersParts:
@@ -150,7 +162,7 @@ def _construct(name: str, config: dict[str, Any]) -> Any:
     try:
         with _TablesOnCpu():
             return SUBFOLDERS[name](**config)
-    except (TypeError, ValueError, IndexError, ArithmeticError) as error:
+    except (TypeError, ValueError, IndexError, ArithmeticError, NameError) as error:
         raise CheckpointError(f"diffusers cannot make a {name} of these settings ({_cause(error)})") from error
 
 
