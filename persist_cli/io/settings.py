@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -37,7 +38,7 @@ def parse_settings(kind: type[T], values: Mapping[str, Any], where: str) -> T:
     """
     from pydantic import ValidationError
 
-    problems = list(_unknown_keys(kind, values, ""))
+    problems = [*_unknown_keys(kind, values, ""), *_infinite_numbers(values, "")]
     instance: T | None = None
     try:
         instance = _adapter_of(kind).validate_python(dict(values))  # type: ignore[arg-type]  # a class is hashable
@@ -104,6 +105,18 @@ def _unknown_keys(kind: Any, values: Any, prefix: str) -> typing.Iterator[str]:
             yield f"unknown key '{prefix}{key}', {hint}"
         else:
             yield from _unknown_keys(_dataclass_in(types_of[key]), value, f"{prefix}{key}.")
+
+
+def _infinite_numbers(value: Any, key: str) -> typing.Iterator[str]:
+    """A message for each number that is infinite or none, which no setting takes."""
+    if isinstance(value, float) and not math.isfinite(value):
+        yield f"{key} is {value}; give a finite number"
+    elif isinstance(value, Mapping):
+        for name, part in value.items():
+            yield from _infinite_numbers(part, f"{key}.{name}" if key else str(name))
+    elif isinstance(value, list | tuple):
+        for number, part in enumerate(value):
+            yield from _infinite_numbers(part, f"{key}[{number}]")
 
 
 def _dataclass_in(kind: Any) -> Any:

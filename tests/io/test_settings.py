@@ -30,6 +30,12 @@ def test_plain_values_become_the_dataclass():
     )
 
 
+@pytest.mark.parametrize("number", [float("inf"), float("-inf"), float("nan")])
+def test_no_setting_takes_a_number_that_is_not_finite(number):
+    with pytest.raises(RecipeError, match=rf"^x: cell\[1\] is {number}; give a finite number$"):
+        parse_settings(Outer, {"name": "a", "cell": [1.0, number, 2.0]}, "x")
+
+
 def test_all_errors_are_reported_at_once_with_the_nearest_keys():
     with pytest.raises(RecipeError) as error:
         parse_settings(Outer, {"inner": {"widht": 4}, "cell": [1, 2], "nmae": "a"}, "my.yaml")
