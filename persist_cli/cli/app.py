@@ -288,7 +288,7 @@ def memorize(
     out: Annotated[Path, typer.Option(help="Memory file to write.")] = Path("memory.safetensors"),
     memory: Annotated[str | None, typer.Option(help="Of `persist plugins`; the checkpoint's, else voxel.")] = None,
     encoder: Annotated[str | None, typer.Option(help="An encoder; `persist plugins` lists them.")] = None,
-    settings: Annotated[list[str] | None, typer.Option("--set", help="As in memory.cell=[0.25,1,0.25].")] = None,
+    settings: Annotated[list[str] | None, typer.Option("--set", help="memory.cell=[0.1,0.1,0.1], encoder.KEY.")] = None,
     checkpoint: Annotated[
         Path | None, typer.Option(help="Whose adapter shall read it; the reference model when no setting is given.")
     ] = None,

@@ -235,7 +235,7 @@ def bench_scene(
     dtype: DtypeOption = None, save_memory: SaveMemoryOption = None,
     settings: Annotated[list[str] | None, typer.Option("--set", help="Of the scenes: memory.KEY=VALUE.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the choice of images and edits.")] = 0,
-    allow_training_scenes: TrainingScenesOption = False,
+    allow_training_scenes: TrainingScenesOption = False, verify: VerifyOption = False,
     out: Annotated[Path, typer.Option(help="Folder of all results; a stopped run goes on.")] = Path("runs/bench-scene"),
     report: Annotated[Path | None, typer.Option(help="Folder for report.html with plans.")] = None,
     json: JsonOption = False,
