@@ -37,16 +37,7 @@ def check_tensors(tensors: Mapping[str, Tensor], expected: Mapping[str, tuple[to
         raise CheckpointError(f"{where}: its tensors are not those of this memory, see {', '.join(mismatched)}")
     count = len(next(iter(tensors.values()))) if tensors else 0
     for name, (dtype, shape) in expected.items():
-        tensor = tensors[name]
-        wanted = (count, *shape[1:])
-        fits = len(tensor.shape) == len(wanted) and all(
-            want is None or have == want for have, want in zip(tensor.shape, wanted, strict=True)
-        )
-        if tensor.dtype != dtype or not fits:
-            actual = f"{tensor.dtype} {list(tensor.shape)}"
-            raise CheckpointError(f"{where}: tensor {name!r} is {actual}, expected {dtype} {list(wanted)}")
-        if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
-            raise CheckpointError(f"{where}: tensor {name!r} has numbers that are not finite")
+        _check_tensor(name, tensors[name], dtype, (count, *shape[1:]), where)
 
 
 def part_of(
@@ -61,14 +52,17 @@ def part_of(
     if names and len(names) < len(expected):
         raise CheckpointError(f"{where}: tensor {min(set(expected) - set(names))!r} is missing")
     for name in names:
-        (dtype, shape), tensor = expected[name], tensors[name]
-        fits = tensor.ndim == len(shape) and all(a in (None, b) for a, b in zip(shape, tensor.shape, strict=True))
-        if tensor.dtype != dtype or not fits:
-            actual = f"{tensor.dtype} {list(tensor.shape)}"
-            raise CheckpointError(f"{where}: tensor {name!r} is {actual}, expected {dtype} {list(shape)}")
-        if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
-            raise CheckpointError(f"{where}: tensor {name!r} has numbers that are not finite")
+        _check_tensor(name, tensors[name], *expected[name], where)
     return [tensors[name] for name in names]
+
+
+def _check_tensor(name: str, tensor: Tensor, dtype: torch.dtype, shape: Shape, where: str) -> None:
+    fits = tensor.ndim == len(shape) and all(a in (None, b) for a, b in zip(shape, tensor.shape, strict=True))
+    if tensor.dtype != dtype or not fits:
+        actual = f"{tensor.dtype} {list(tensor.shape)}"
+        raise CheckpointError(f"{where}: tensor {name!r} is {actual}, expected {dtype} {list(shape)}")
+    if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
+        raise CheckpointError(f"{where}: tensor {name!r} has numbers that are not finite")
 
 
 def with_origins(tensors: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -48,10 +48,10 @@ class Surfaces:
         """Return the class of each surface's cell, 0 (free) where there is none."""
         return grid.classes.flatten()[self.cells.clamp(min=0)] * self.hit
 
-    def colors(self, grid: CellGrid, background: int = 0) -> UInt8[Tensor, "layer frame height width 3"]:
-        """Return the colour of each surface's cell, and a grey where there is none."""
+    def colors(self, grid: CellGrid) -> UInt8[Tensor, "layer frame height width 3"]:
+        """Return the colour of each surface's cell, and black where there is none."""
         found = grid.colors.flatten(0, 2)[self.cells.clamp(min=0)]
-        return torch.where(self.hit[..., None], found, torch.full_like(found, background))
+        return torch.where(self.hit[..., None], found, torch.zeros_like(found))
 
 
 def first_surfaces(

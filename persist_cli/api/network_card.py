@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from persist_cli.api.checkpoint import run_folder, step_folders
+from persist_cli.api.checkpoint import step_folders
 from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import file_sha256, read_json, write_json
@@ -44,7 +44,6 @@ class NetworkCard:
 
     Args:
         folder: the folder of card and weights.
-        name: name of the run or folder, which tables show.
         plugin: name of the plugin.
         settings: plain settings of the network.
         fingerprint: a hash of its weights.
@@ -53,7 +52,6 @@ class NetworkCard:
     """
 
     folder: Path
-    name: str
     plugin: str
     settings: dict[str, Any]
     fingerprint: str
@@ -101,7 +99,7 @@ def find_card(kind: CardKind, path: Path) -> NetworkCard:
     scenes = card.get("training_scenes")
     try:
         return NetworkCard(
-            folder, run_folder(folder).name, str(card[kind.plugin]), dict(card["settings"]), str(card["fingerprint"]),
+            folder, str(card[kind.plugin]), dict(card["settings"]), str(card["fingerprint"]),
             None if scenes is None else TrainingScenes.from_json(scenes), card,
         )  # fmt: skip
     except (KeyError, TypeError, ValueError) as error:

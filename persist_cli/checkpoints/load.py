@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from persist_cli.api.backbone import Backbone, Sampling
 from persist_cli.api.checkpoint import CODEC_ALONE, GUIDE, PLAIN, Checkpoint, find_checkpoint, read_card
 from persist_cli.api.inference import CONSISTENCY, SamplingOverrides
+from persist_cli.api.meta_device import without_weights
 from persist_cli.api.scene import Scene
 from persist_cli.checkpoints.lineage import MEMORY_FILE, RECIPE
 from persist_cli.checkpoints.scene_models import with_absolute_model, with_model_beside
@@ -16,11 +18,8 @@ from persist_cli.errors import CheckpointError, PersistError, RecipeError
 from persist_cli.io.files import read_json
 from persist_cli.io.settings import parse_settings
 from persist_cli.output.console import warn
-from persist_cli.plugins import load_plugin
+from persist_cli.plugins import load_plugin, make_backbone
 from persist_cli.recipe import BackboneConfig, MemoryConfig, Recipe, recipe_values
-
-if TYPE_CHECKING:
-    from persist_cli.api.backbone import Backbone, Sampling
 
 
 def load_backbone(
@@ -43,9 +42,6 @@ def load_backbone(
 
 def empty_backbone(checkpoint: Checkpoint, settings: dict[str, Any] | None = None) -> Backbone:
     """The backbone of the checkpoint's base on the meta device, without weights; it knows where its guide is."""
-    from persist_cli.api.meta_device import without_weights
-    from persist_cli.plugins import make_backbone
-
     with without_weights():
         backbone = make_backbone(checkpoint.backbone, merge_settings(checkpoint.settings, settings or {}))
     guide = checkpoint.base_folder / GUIDE
@@ -194,8 +190,6 @@ def start_backbone(recipe: Recipe, base: Checkpoint | None) -> Backbone:
         RecipeError: when the base is of another backbone than the recipe's, was built by other settings, or has no
             trained video model for a memory or LoRA to be trained on.
     """
-    from persist_cli.plugins import load_plugin, make_backbone
-
     config = recipe.backbone
     if base is None:
         return make_backbone(config.name, config.settings)
@@ -245,15 +239,11 @@ def check_frozen(config: BackboneConfig, base: Checkpoint) -> None:
 
 def takes_codec_alone(checkpoint: Checkpoint) -> bool:
     """Whether the backbone of a checkpoint can take the codec of one alone."""
-    from persist_cli.api.backbone import Backbone
-
     return load_plugin("backbone", checkpoint.backbone).load_codec is not Backbone.load_codec
 
 
 def fresh_on_codec(checkpoint: Checkpoint, settings: Mapping[str, Any]) -> Backbone:
     """A backbone with fresh weights on the codec of a checkpoint; the settings replace those of the checkpoint."""
-    from persist_cli.plugins import make_backbone
-
     checkpoint.check_weights(None)
     of_weights = load_plugin("backbone", checkpoint.backbone).of_weights
     own = {name: value for name, value in checkpoint.settings.items() if name not in of_weights}

@@ -59,7 +59,7 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Checkpoint:
+class AgentStates:
     """The state of agents at a time when all shown frames are remembered.
 
     Args:
@@ -75,9 +75,9 @@ class Checkpoint:
     surroundings: tuple[Surroundings | None, ...]
 
     @staticmethod
-    def of(agents: Sequence[Agent]) -> Checkpoint:
+    def of(agents: Sequence[Agent]) -> AgentStates:
         """Return the state of agents."""
-        return Checkpoint(
+        return AgentStates(
             tuple(agent.now for agent in agents),
             tuple(agent.clips for agent in agents),
             tuple(agent.memory and agent.memory.copy() for agent in agents),
@@ -101,8 +101,8 @@ class History:
         start: where the walk begins.
     """
 
-    start: Checkpoint
-    _parts: list[tuple[Checkpoint, list[Step]]] = field(init=False)
+    start: AgentStates
+    _parts: list[tuple[AgentStates, list[Step]]] = field(init=False)
 
     def __post_init__(self) -> None:
         self._parts = [(self.start, [])]
@@ -114,9 +114,9 @@ class History:
     def remembered(self, agents: Sequence[Agent]) -> None:
         """Keep a checkpoint if it is time; to be called when all shown frames are remembered."""
         if len(self._parts[-1][1]) >= UNDO:
-            self._parts = [self._parts[-1], (Checkpoint.of(agents), [])]
+            self._parts = [self._parts[-1], (AgentStates.of(agents), [])]
 
-    def undo(self) -> tuple[Checkpoint, Sequence[Step]] | None:
+    def undo(self) -> tuple[AgentStates, Sequence[Step]] | None:
         """Forget the last step; return the checkpoint before it and the steps since, ``None`` if there is no step."""
         if not self._parts[-1][1] and len(self._parts) > 1:
             self._parts.pop()

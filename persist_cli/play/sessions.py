@@ -213,7 +213,7 @@ class Session:
             return
 
 
-def one_line(text: str, most: int = 300) -> str:
-    """Return a text in one line, cut where it is too long."""
+def one_line(text: str) -> str:
+    """Return a text in one line of at most 300 letters."""
     line = " ".join(text.split())
-    return line if len(line) <= most else f"{line[: most - 1]}…"
+    return line if len(line) <= 300 else f"{line[:299]}…"

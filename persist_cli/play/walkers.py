@@ -19,7 +19,7 @@ from persist_cli.api.cameras import Cameras
 from persist_cli.api.cells import CellGrid
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.data.clips import interactions_of
-from persist_cli.play.history import Checkpoint, History, SceneState, Step
+from persist_cli.play.history import AgentStates, History, SceneState, Step
 from persist_cli.rollout.surroundings import plan_walks
 from persist_cli.rollout.world_model import Agent, WorldModel
 
@@ -115,14 +115,14 @@ class Walkers:
             world.agents[0].memory = memory and memory.copy()
             world.reset([start], [info])
         self._shown = [[] for _ in self.worlds]
-        self._history = History(Checkpoint.of(self.agents))
+        self._history = History(AgentStates.of(self.agents))
         self._cells = self._present_cells()
         self.version += 1
 
     def begin_here(self) -> None:
         """Remember what was shown, and let no undo go back behind the present frame."""
         self.remember()
-        self._history = History(Checkpoint.of(self.agents))
+        self._history = History(AgentStates.of(self.agents))
 
     def set_clip_frames(self, frames: int) -> None:
         """Let the next clips have so many frames, the present one included.

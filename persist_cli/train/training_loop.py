@@ -169,7 +169,7 @@ class TrainingLoop(ABC, Generic[Model]):
         return {}
 
     def encoded(self, batch: Any) -> Any:
-        """The batch as the model takes it in this step; a subclass may measure a part of the work here."""
+        """The batch as the model takes it in this step, which may be shorter than it was read."""
         return batch
 
     def loader(self) -> Generator[Any, None, None]:

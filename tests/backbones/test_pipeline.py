@@ -46,8 +46,8 @@ def call(pipeline: WorldPipeline, **changes: object) -> WorldPipelineOutput:
     pipeline.set_progress_bar_config(disable=True)
     seeds = [torch.Generator().manual_seed(seed) for seed in CLIPS.seeds]
     options = {"num_inference_steps": 3, "guidance_scale": 1.5, "generator": seeds, "output_type": "pt"}
-    options |= {"memory_tokens": CLIPS.tokens} | changes
-    return pipeline(CLIPS.rgb[:, 0], CLIPS.depth[:, 0], CLIPS.cameras, **options)
+    options |= {"memory_tokens": CLIPS.tokens, "cameras": CLIPS.cameras} | changes
+    return pipeline(CLIPS.rgb[:, 0], CLIPS.depth[:, 0], **options)
 
 
 def same(one: WorldPipelineOutput, two: WorldPipelineOutput) -> bool:
@@ -62,6 +62,15 @@ def test_a_pipeline_gives_the_clips_of_its_backbone(form):
     output = call(WorldPipeline.of(backbone))
     assert torch.equal((output.frames.movedim(2, -1) * 255).round().to(torch.uint8), rgb)
     assert torch.equal(output.depth, depth)
+
+
+def test_a_pipeline_makes_shorter_clips_where_its_backbone_does():
+    backbone = micro(**FRAMEWISE)
+    shaken(backbone)
+    clips = random_clips(2).shortened(4)
+    output = call(WorldPipeline.of(backbone), cameras=clips.cameras, **PLAIN)
+    assert torch.equal(output.depth, backbone.generate(clips, Sampling(3))[1])
+    assert output.depth.shape[1] == 4
 
 
 @FORMS
@@ -237,7 +246,7 @@ def test_a_pipeline_takes_and_returns_pictures_and_arrays_and_takes_noise():
         ({"generator": [torch.Generator()]}, "^1 generators for 2 images; give one, or one for each$"),
         ({"memory_tokens": random_tokens(1, 5)}, "^memory_tokens of 1 samples, but 2 images$"),
         ({"callback_on_step_end_tensor_inputs": ["prompt"]}, "tensor_inputs has prompt; known: latents$"),
-        ({"interactions": [(None,) * 3] * 2}, "^interactions of 3 steps; a clip of this model has 8$"),
+        ({"interactions": [(None,) * 3] * 2}, "^interactions of 3 steps; a clip of 9 frames has 8$"),
     ],
 )
 def test_arguments_that_cannot_be_sampled_are_refused(changes, cause):
@@ -277,7 +286,9 @@ def test_images_depth_and_cameras_of_other_sizes_are_refused():
         pipeline(rgb[:, :16], depth, CLIPS.cameras)
     with pytest.raises(PersistError, match=r"depth of 16x32 and cameras of 32x32; they must be one size$"):
         pipeline(rgb, depth[:, :16], CLIPS.cameras)
-    with pytest.raises(PersistError, match=r"^cameras of 5 frames; a clip of this model has 9$"):
+    with pytest.raises(
+        PersistError, match=r"^clips of 5 frames, the given one included; this model makes clips of 9 frames$"
+    ):
         pipeline(rgb, depth, CLIPS.cameras[(slice(None), slice(5))])
 
 

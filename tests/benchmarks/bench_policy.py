@@ -55,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "another goal": correlations(network, samples, samples.goal[others], ~hidden, options.ways),
             "no goal": correlations(network, samples, samples.goal, hidden, options.ways),
         }
-    say(f"{trained.name}: {len(others)} moments of {', '.join(map(str, options.data or ['sample']))}")
+    say(f"{trained.folder}: {len(others)} moments of {', '.join(map(str, options.data or ['sample']))}")
     print_table(
         "correlation with what the walk did", ["asked with", "ahead", "to the side", "distance"],
         [[name, *(f"{value:.2f}" for value in row.values())] for name, row in rows.items()],

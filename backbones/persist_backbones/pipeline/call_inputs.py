@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,7 @@ def make_clips(
     cameras: Cameras | Sequence[Cameras],
     interactions: Sequence[Interactions] | None,
     tokens: MemoryTokens | Sequence[MemoryTokens] | None,
-    frames: int,
+    check_frames: Callable[[int], None],
 ) -> Clips:
     """Make the batch of clips that begin with these images.
 
@@ -33,16 +33,16 @@ def make_clips(
         cameras: cameras of every frame of a clip, the image's first; a batch or a list of them.
         interactions: one sequence a sample; ``None`` for no interactions.
         tokens: tokens from ``Memory.read``, of one sample, a batch or a list of samples.
-        frames: number of frames of a clip.
+        check_frames: raises ``PersistError`` when clips of so many frames cannot be made.
 
     Raises:
-        DataError: one line when their sizes or numbers do not fit each other.
+        PersistError: one line when their sizes or numbers do not fit each other or the model.
     """
     batch, height, width = images.shape[:3]
     path = batch_of_cameras(cameras)
     metres = torch.zeros(batch, height, width) if depth is None else batch_of_depth(depth)
-    if path.world_from_camera.shape[1] != frames:
-        raise DataError(f"cameras of {path.world_from_camera.shape[1]} frames; a clip of this model has {frames}")
+    frames = path.world_from_camera.shape[1]
+    check_frames(frames)
     if (path.height, path.width) != (height, width) or metres.shape[1:] != (height, width):
         raise DataError(
             f"an image of {height}x{width} pixels, depth of {metres.shape[1]}x{metres.shape[2]} and cameras of "
@@ -57,7 +57,7 @@ def make_clips(
             raise DataError(f"{name} of {count} samples, but {batch} images")
     wrong = next((len(one) for one in steps if len(one) != frames - 1), None)
     if wrong is not None:
-        raise DataError(f"interactions of {wrong} steps; a clip of this model has {frames - 1}")
+        raise DataError(f"interactions of {wrong} steps; a clip of {frames} frames has {frames - 1}")
     return Clips(images[:, None], metres[:, None], path, steps, memory, seeds=range(batch))
 
 

@@ -192,7 +192,7 @@ class WorldPipeline(OffloadingPipeline):
         sampling, backbone = Sampling(num_inference_steps, self._sampler(), guidance_scale), self.backbone
         self._check(sampling, output_type, callback_on_step_end_tensor_inputs, memory_tokens is not None)
         images = self._images(image)
-        first = make_clips(images, depth, cameras, interactions, memory_tokens, backbone.frames_per_clip)
+        first = make_clips(images, depth, cameras, interactions, memory_tokens, backbone.check_clip_frames)
         generators = generators_for(generator, len(images))
         self._guidance_scale, self._num_timesteps, self._interrupt = guidance_scale, num_inference_steps, False
         with self.progress_bar(total=num_inference_steps) as bar:

@@ -49,10 +49,12 @@ class ViewsMemory(FrameMemory):
 
     def kept(self, store: FrameStore) -> FrameStore:
         """Return the images without the most redundant ones of an origin that has too many."""
+        left = torch.ones_like(store.origins, dtype=torch.bool)
         for origin in Origin:
-            while int((store.origins == origin).sum()) > self.settings.capacity:
-                store = store[_without_most_redundant(store, (store.origins == origin).nonzero()[:, 0])]
-        return store
+            among = (store.origins == origin).nonzero()[:, 0]
+            if len(among) > self.settings.capacity:
+                left[among[_redundant(store.cameras[among], len(among) - self.settings.capacity)]] = False
+        return store if bool(left.all()) else store[left.nonzero()[:, 0]]
 
     def choose(self, store: FrameStore, cameras: Cameras, count: int) -> Int64[Tensor, " chosen"]:
         """Return the images that together cover most of the view, the nearest of equally good ones first."""
@@ -81,11 +83,14 @@ def in_field_of_view(points: Float[Tensor, "point 3"], cameras: Cameras) -> Bool
     return locate(points[None], poses, intrinsics, size, (1, 1))[2][0]
 
 
-def _without_most_redundant(store: FrameStore, among: Int64[Tensor, " frame"]) -> Int64[Tensor, " frame"]:
-    """Return the numbers of all frames but the one of ``among`` whose view most others see; the oldest of equals."""
-    cameras = store.cameras[among]
-    seen = in_field_of_view(view_points(cameras).flatten(0, 1), cameras).unflatten(1, (len(among), -1))
-    own = torch.eye(len(among), dtype=torch.bool, device=among.device)[..., None]
-    share = (seen & ~own).sum(0).double().mean(-1)
-    numbers = torch.arange(len(store), device=among.device)
-    return numbers[numbers != among[share.argmax()]]
+def _redundant(cameras: Cameras, count: int) -> Int64[Tensor, " frame"]:
+    """Return the numbers of so many frames, each that whose view most of those left see; the oldest of equals."""
+    seen = in_field_of_view(view_points(cameras).flatten(0, 1), cameras).unflatten(1, (len(cameras), -1))
+    seen &= ~torch.eye(len(cameras), dtype=torch.bool, device=seen.device)[..., None]
+    seen_by, left = seen.sum(0), torch.ones(len(cameras), dtype=torch.bool, device=seen.device)
+    for _ in range(count):
+        share = seen_by.double().mean(-1).where(left, -1.0)
+        leaving = int(share.argmax())
+        seen_by -= seen[leaving].long()
+        left[leaving] = False
+    return (~left).nonzero()[:, 0]

@@ -90,7 +90,7 @@ def _apply(tensors: dict[str, Tensor], form: MapForm, edit: Edit) -> tuple[dict[
     return joined, count * (2 if isinstance(edit, Move) else 1)
 
 
-def _in_box(tensors: Mapping[str, Tensor], form: MapForm, edit: Remove | Paint | Move | Copy) -> Bool[Tensor, " cell"]:
+def _in_box(tensors: Mapping[str, Tensor], form: MapForm, edit: Boxed) -> Bool[Tensor, " cell"]:
     """Return which cells have their middle in a box seen from above, and are touched by it in height."""
     if not tensors or not len(tensors[CELLS]):
         raise DataError("the memory is empty")

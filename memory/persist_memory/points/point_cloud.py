@@ -65,7 +65,8 @@ class PointCloud(Memory):
 
     def __init__(self, settings: PointCloudSettings, encoder: Encoder, reference: FrameOfReference) -> None:
         super().__init__(settings, encoder, reference)
-        self._stored: dict[str, Tensor] = {}
+        self._joined: dict[str, Tensor] = {}
+        self._added: list[dict[str, Tensor]] = []  # which are sorted in when they are needed, all at once
 
     def write(self, observations: Observations) -> None:
         """Add a point for every pixel of the strided image that has valid depth.
@@ -75,8 +76,7 @@ class PointCloud(Memory):
         """
         check_observations(observations, f"memory {self.name!r}")
         for origin, frames in with_finite_depth(observations).by_origin() if len(observations) else ():
-            known = self._of(Origin.OBSERVED)
-            if origin == Origin.IMAGINED and known:
+            if origin == Origin.IMAGINED and (known := self._of(Origin.OBSERVED)):
                 positions = known["positions"].to(frames.depth.device)
                 frames = without_known(frames, covered(positions, self.settings.spread, frames.cameras))
             self._absorb(self._points_of(frames, origin))
@@ -97,7 +97,7 @@ class PointCloud(Memory):
     def copy(self) -> Self:
         """Return a cloud of the same points; the two share their tensors, which are never changed in place."""
         copy = type(self)(self.settings, self.encoder, self.reference)
-        copy._stored = dict(self._stored)
+        copy._joined = dict(self._stored)
         return copy
 
     def tensors(self) -> dict[str, Tensor]:
@@ -122,7 +122,7 @@ class PointCloud(Memory):
             }
             check_tensors(tensors, expected, where)
             check_origins(tensors, where)
-        self._stored = {}
+        self._joined, self._added = {}, []
         self._absorb(tensors)
 
     def merge(self, other: Memory) -> None:
@@ -168,12 +168,20 @@ class PointCloud(Memory):
         return values | {RANKS: ranks(values["features"], values["colors"], seen_at)}
 
     def _absorb(self, added: dict[str, Tensor]) -> None:
-        """Add points, in the order of their positions, each once; observed ones replace imagined ones near them."""
-        if not added:
-            return
-        parts = [self._stored, added] if self._stored else [added]
+        if added:
+            self._added.append(added)
+
+    @property
+    def _stored(self) -> dict[str, Tensor]:
+        """All points in the order of their positions, each once; observed ones replace imagined ones near them."""
+        if self._added:
+            self._joined = self._join([self._joined, *self._added] if self._joined else self._added)
+            self._added = []
+        return self._joined
+
+    def _join(self, parts: list[dict[str, Tensor]]) -> dict[str, Tensor]:
         device = parts[0]["positions"].device
-        joined = {name: torch.cat([part[name].to(device) for part in parts]) for name in added}
+        joined = {name: torch.cat([part[name].to(device) for part in parts]) for name in parts[0]}
         keep = torch.ones(len(joined[ORIGINS]), dtype=torch.bool, device=device)
         imagined = joined[ORIGINS] == Origin.IMAGINED
         if bool(imagined.any()) and not bool(imagined.all()):
@@ -182,7 +190,7 @@ class PointCloud(Memory):
             keep = ~(imagined & torch.isin(cell, cell[~imagined]))
         joined = {name: tensor[keep] for name, tensor in joined.items()}
         order = distinct_order(torch.cat([joined["positions"], joined["features"][:, :1].double()], dim=1))
-        self._stored = {name: tensor[order] for name, tensor in joined.items()}
+        return {name: tensor[order] for name, tensor in joined.items()}
 
 
 def distinct_order(rows: Float[Tensor, "row number"]) -> Int64[Tensor, " distinct"]:

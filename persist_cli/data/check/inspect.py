@@ -234,10 +234,10 @@ def _total(values: Sequence[float], form: Callable[[Any], str]) -> str:
     return f"{form(sum(values))} ({form(min(values))} to {form(max(values))} each)"
 
 
-def _distinct(values: Sequence[str], most: int = 3) -> str:
-    """The different values, the most frequent first."""
+def _distinct(values: Sequence[str]) -> str:
+    """The three most frequent of the different values, and how many more there are."""
     counted = [value for value, _ in Counter(values).most_common()]
-    return ", ".join(counted[:most]) + (f" and {len(counted) - most} more" if len(counted) > most else "")
+    return ", ".join(counted[:3]) + (f" and {len(counted) - 3} more" if len(counted) > 3 else "")
 
 
 def _metres(value: float | None) -> str:
