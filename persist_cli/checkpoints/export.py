@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any, Final
 
 import torch
+from safetensors import SafetensorError
 
 from persist_cli import __version__
-from persist_cli.api.backbone import Sampling
+from persist_cli.api.backbone import Backbone, Sampling
 from persist_cli.api.checkpoint import CODEC_ALONE, GUIDE, PLAIN, Checkpoint, find_checkpoint, lora_base, read_card
 from persist_cli.api.inference import SamplingOverrides
 from persist_cli.api.scene import Scene
@@ -41,7 +42,7 @@ from persist_cli.checkpoints.load import (
     check_noise,
     empty_backbone,
     fresh_on_codec,
-    is_own_codec,
+    is_codec_alone,
     load_backbone,
     takes_codec_alone,
     warn_of_plain,
@@ -122,7 +123,7 @@ def run_export(plan: ExportPlan, out: Path, json: bool) -> None:
         export_scene_model(plan, out, json)
         return
     base = find_checkpoint(plan.checkpoint)
-    if plan.codec or (takes_codec_alone(base) and is_own_codec(base)):
+    if plan.codec or is_codec_alone(base):
         export_codec(plan, base, out, json)
         return
     adapters = _find_adapters(base, plan.runs)
@@ -169,7 +170,7 @@ def export_codec(plan: ExportPlan, base: Checkpoint, out: Path, json: bool) -> N
         with empty_folder_aside(folder) as home:
             with busy("loading the codec"), torch.random.fork_rng(devices=[]):
                 torch.manual_seed(0)
-                fresh_on_codec(base, {}).save_base(home)
+                _save_base(fresh_on_codec(base, {}), home)
             _write_checkpoint(folder, home, {}, {}, PRECISIONS[plan.dtype])
         save_stage_recipes(
             folder, {name: text for name, text in _recipes(base, {}).items() if name.startswith("codec")}
@@ -364,7 +365,8 @@ def _write_checkpoint(
         try:
             convert(source, target, dtype) if source.suffix == ".safetensors" else copy_part(source, target)
         except OSError as error:  # a run that still trains clears its old checkpoints away; a disk fills up
-            raise CheckpointError(f"{source}: cannot be exported ({error.strerror or error})") from error
+            place = error.filename or target
+            raise CheckpointError(f"{place}: cannot be exported ({error.strerror or error})") from error
     for name, adapter in adapters.items():
         _put_scene_model_beside(adapter, folder / ADAPTERS / name, dtype)
 
@@ -387,6 +389,13 @@ def _put_scene_model_beside(adapter: AdapterSource, folder: Path, dtype: torch.d
     write_json(folder / MEMORY_FILE, asdict(replace(memory, settings=memory.settings | {"model": BESIDE})))
 
 
+def _save_base(backbone: Backbone, folder: Path) -> None:
+    try:
+        backbone.save_base(folder)
+    except SafetensorError as error:  # as where a disk is full
+        raise CheckpointError(f"{folder}: cannot be written ({error})") from error
+
+
 @contextlib.contextmanager
 def _merged_base(base: Checkpoint, beside: Path) -> Iterator[Path]:
     """A folder with all of a base's own files; where LoRA has to be merged, it is made aside and removed again."""
@@ -395,7 +404,7 @@ def _merged_base(base: Checkpoint, beside: Path) -> Iterator[Path]:
         return
     with empty_folder_aside(beside) as folder:
         with busy("merging LoRA into its base"):
-            load_backbone(base).save_base(folder)
+            _save_base(load_backbone(base), folder)
         yield folder
 
 

@@ -12,6 +12,7 @@ import yaml
 from persist_cli.api.checkpoint import CARD, STEP
 from persist_cli.checkpoints.lineage import RECIPE, RECIPES
 from persist_cli.errors import CheckpointError
+from persist_cli.io.command_line import quoted
 from persist_cli.io.files import read_json, read_tensors, write_json, write_tensors, write_text
 from persist_cli.io.sha256sums import SUMS, read_sums
 from persist_cli.io.yaml_text import parse_yaml_mapping
@@ -114,4 +115,4 @@ def print_files(out: Path, card: dict[str, Any], files: dict[str, dict[str, Any]
         return
     rows = [(name, f"{file['bytes']:,}") for name, file in files.items()]
     print_table(str(out), ("file", "bytes"), [*rows, ("all", f"{total:,}")])
-    say(f"{total / 1e6:.1f} MB, weights in {card['dtype']}; check them with: cd {out} && sha256sum -c {SUMS}")
+    say(f"{total / 1e6:.1f} MB, weights in {card['dtype']}; check them with: cd {quoted(out)} && sha256sum -c {SUMS}")

@@ -57,10 +57,19 @@ def checked_sampling(checkpoint: Checkpoint, overrides: SamplingOverrides, proto
     Raises:
         PersistError: when the backbone cannot sample so.
     """
+    check_video_model(checkpoint)
     sampling = checkpoint.sampling_with(overrides, protocol)
     empty_backbone(checkpoint).check_sampling(sampling)
     check_noise(sampling, [checkpoint])
     return sampling
+
+
+def check_video_model(checkpoint: Checkpoint) -> None:
+    """Raise ``CheckpointError`` for a codec alone, which imagines noise."""
+    if is_codec_alone(checkpoint):
+        raise CheckpointError(
+            f"{checkpoint.folder}: a codec alone, whose video model was not trained; train stage 1 on it, and name that"
+        )
 
 
 def check_noise(sampling: Sampling, checkpoints: Iterable[Checkpoint]) -> None:
@@ -195,7 +204,7 @@ def start_backbone(recipe: Recipe, base: Checkpoint | None) -> Backbone:
         return make_backbone(config.name, config.settings)
     if base.backbone != config.name:
         raise RecipeError(f"base {base.folder} is of backbone {base.backbone!r}, not {config.name!r}")
-    codec_alone = takes_codec_alone(base) and is_own_codec(base)
+    codec_alone = is_codec_alone(base)
     if codec_alone and (recipe.memory is not None or recipe.lora is not None):
         raise RecipeError(
             f"base {base.folder}: a codec alone, whose video model was not trained; train stage 1 on it, and name that"
@@ -271,6 +280,17 @@ def changed_settings(settings: Mapping[str, Any], changes: Mapping[str, Any]) ->
         elif value != own:
             changed.append(key)
     return changed
+
+
+def is_codec_alone(checkpoint: Checkpoint) -> bool:
+    """Whether a checkpoint's base is a codec whose video model was not trained."""
+    return takes_codec_alone(checkpoint) and is_own_codec(checkpoint)
+
+
+def trains_codec_alone(recipe: Recipe, base: Checkpoint | None) -> bool:
+    """Whether what a recipe trains on a base is such a codec."""
+    begins_random = not recipe.backbone.settings.get("pretrained") if base is None else is_codec_alone(base)
+    return recipe.stage == "codec" and begins_random
 
 
 def is_own_codec(base: Checkpoint) -> bool:

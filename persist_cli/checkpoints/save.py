@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
-from persist_cli.api.checkpoint import CARD, PACKAGED, STARTED_FROM, VERSION, Checkpoint
+from persist_cli.api.checkpoint import CARD, CODEC_ALONE, PACKAGED, STARTED_FROM, VERSION, Checkpoint
 from persist_cli.api.inference import CONSISTENCY
 from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.checkpoints.lineage import MEMORY_FILE
@@ -26,6 +26,7 @@ def save_base(
     scenes: TrainingScenes | None = None,
     base: Checkpoint | None = None,
     home: Path | None = None,
+    codec_alone: bool = False,
 ) -> None:
     """Write the backbone's own files, a card and ``SHA256SUMS``.
 
@@ -35,11 +36,12 @@ def save_base(
         scenes: the scenes that it was trained on, where they are known.
         base: the checkpoint that the training started from, which a resumed run looks for.
         home: the place where the folder will be in the end, by default the folder itself.
+        codec_alone: whether the card says that its video model was not trained.
     """
     backbone.save_base(folder)
     hashes = hash_weights(folder)
     card = {"backbone": backbone.name, "settings": backbone.checkpoint_settings(), "fingerprint": fingerprint(hashes)}
-    card |= asked_sampling(backbone, base)
+    card |= asked_sampling(backbone, base) | ({CODEC_ALONE: True} if codec_alone else {})
     started = {} if base is None else {STARTED_FROM: pointer_to(base.base_folder, base.fingerprint, home or folder)}
     write_card(folder, card | started, scenes)
     write_sums(folder, hashes)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 import psutil
@@ -58,8 +60,26 @@ def machine_of(gpus: int | None, gpu_memory: float | None) -> Machine:
         raise PersistError(f"--gpu-memory {gpu_memory}: give the GB of a card, as in 80")
     here = torch.cuda.device_count()
     if gpus is None and gpu_memory is None and not here:
-        return Machine("cpu", 1, psutil.virtual_memory().total)
+        return Machine("cpu", 1, memory_here())
     if gpu_memory is None and not here:
         raise PersistError("--gpus: there is no GPU here to know its memory of; give --gpu-memory GB, as in 80")
     memory = torch.cuda.get_device_properties(0).total_memory if gpu_memory is None else round(gpu_memory * GIB)
     return Machine("cuda", gpus or (1 if gpu_memory else here), memory)
+
+
+def memory_here(proc: Path = Path("/proc/self/cgroup"), groups: Path = Path("/sys/fs/cgroup")) -> int:
+    """Return the bytes of memory that this process may use: those of the machine, or of a container or batch job.
+
+    Args:
+        proc: the file of Linux that names this process's control group (version 2).
+        groups: the folder of all control groups.
+    """
+    limits: list[int] = [psutil.virtual_memory().total]
+    with contextlib.suppress(OSError):
+        own = next((line[3:] for line in proc.read_text().splitlines() if line.startswith("0::")), "/")
+        group = groups / own.strip("/")
+        for folder in (group, *group.parents):
+            limit = folder / "memory.max"
+            if folder.is_relative_to(groups) and limit.is_file() and limit.read_text().strip().isdigit():
+                limits.append(int(limit.read_text()))
+    return min(limits)

@@ -9,7 +9,7 @@ from pathlib import Path
 from persist_cli.api.backbone import Backbone, Sampling
 from persist_cli.api.checkpoint import Checkpoint
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
-from persist_cli.checkpoints.load import check_noise, empty_backbone, load_backbone
+from persist_cli.checkpoints.load import check_noise, check_video_model, empty_backbone, load_backbone
 from persist_cli.data.clips import check_size
 from persist_cli.data.store import Store
 from persist_cli.errors import CheckpointError
@@ -93,6 +93,8 @@ def common_sampling(checkpoints: Sequence[Checkpoint], overrides: SamplingOverri
     Raises:
         CheckpointError: when the cards give different ones, because rows of one table are sampled alike.
     """
+    for checkpoint in checkpoints:
+        check_video_model(checkpoint)
     checkpoints_by_sampling = {checkpoint.sampling_with(overrides, protocol): checkpoint for checkpoint in checkpoints}
     if len(checkpoints_by_sampling) > 1:
         samplings = " and ".join(

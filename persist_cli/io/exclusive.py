@@ -33,18 +33,22 @@ def exclusive(folder: Path, main: bool = True) -> Iterator[None]:
     from filelock import FileLock, Timeout
 
     with made_folder(folder):
-        lock = FileLock(folder / LOCK, timeout=0)
+        lock = FileLock(folder / LOCK, timeout=0, mode=0o666)  # another user's command shall find it taken
         try:
             lock.acquire()
         except Timeout as error:
             raise PersistError(
                 f"{folder}: another command is writing there; wait until it has ended, or choose another --out"
             ) from error
+        except PermissionError as error:
+            if (folder / LOCK).exists():
+                raise PersistError(f"{folder / LOCK}: another user's; wait until that command has ended") from error
         except OSError:
             pass  # the file system has no locks
         try:
             yield
         finally:
             with contextlib.suppress(OSError):  # Windows removes no file that is open
-                Path(lock.lock_file).unlink()
+                if lock.is_locked:
+                    Path(lock.lock_file).unlink()
             lock.release()

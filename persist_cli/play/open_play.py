@@ -12,7 +12,14 @@ from persist_cli.api.inference import CONSISTENCY, InferenceOptions, SamplingOve
 from persist_cli.api.memory import Memory
 from persist_cli.api.memory_file import is_memory_file, read_header
 from persist_cli.api.observations import Trajectory
-from persist_cli.checkpoints.load import adapter_memory, empty_backbone, load_adapter, load_backbone, warn_of_plain
+from persist_cli.checkpoints.load import (
+    adapter_memory,
+    check_video_model,
+    empty_backbone,
+    load_adapter,
+    load_backbone,
+    warn_of_plain,
+)
 from persist_cli.checkpoints.placement import check_placement
 from persist_cli.data.clips import check_size
 from persist_cli.errors import CheckpointError, DataError
@@ -77,6 +84,7 @@ def open_walks(options: PlayOptions) -> Callable[[], Play]:
     names = chosen_memories(checkpoint, options.memories)
     size, scenes = empty_backbone(checkpoint).image_size, checkpoint.training_scenes
     start = read_start(options.begin, size, None if scenes is None else scenes.fov)
+    check_video_model(checkpoint)
     check_size(start.info, size, options.begin.start)
     with busy("loading the memories"):  # before the model, so that what cannot work fails at once
         memories = {name: _memory(checkpoint, name, options, start) for name in names}

@@ -234,11 +234,15 @@ def _gain(cell: Cell, other: str) -> Gain:
 
 
 def points_of(plan: Plan) -> Iterator[Point]:
-    """The gains that are measured so far, recipe by recipe."""
-    for name, recipe in plan.all_recipes().items():
-        for samples in plan.samples:
-            if (result_folder(plan, name, samples) / "metrics.json").is_file():
-                yield read_point(plan, name, recipe, samples)
+    """The gains that are measured so far, in earlier runs too: recipe by recipe, those of this plan first."""
+    found: dict[str, list[int]] = {name: [] for name in plan.recipes}
+    for file in sorted(plan.out.glob("eval/*/metrics.json")):
+        name, _, number = file.parent.name.rpartition("-")
+        found.setdefault(name, []).append(int(number))
+    for name in found:
+        recipe = make_recipe(read_recipe(name), name)
+        for samples in sorted(found[name]):
+            yield read_point(plan, name, recipe, samples)
 
 
 def write_results(plan: Plan, left_out: dict[str, str]) -> None:

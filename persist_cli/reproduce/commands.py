@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 from types import FrameType
 from typing import Final
 
-from persist_cli.cli.options import outlive_listeners, print_any_letter
-from persist_cli.errors import PersistError
+from persist_cli.cli.options import outlive_listeners, print_any_letter, system_error
+from persist_cli.errors import INTERRUPTED, PersistError
 from persist_cli.io.signals import caught_signals
 from persist_cli.output.console import say
 
@@ -49,13 +49,21 @@ def run_main(main: Callable[[Sequence[str]], None]) -> None:
         main(sys.argv[1:])
     except PersistError as error:
         sys.exit(f"error: {error}")
+    except OSError as error:
+        sys.exit(f"error: {system_error(error)}")
+    except KeyboardInterrupt:
+        say("stopped; the same command goes on here")
+        sys.exit(INTERRUPTED)
 
 
 def run_line(line: str) -> None:
     """Run a command of persist in a process of its own; end this one with its exit code when it fails."""
     say(f"\n$ persist {line}")
     code = run_command([sys.executable, "-m", "persist_cli", *shlex.split(line)])
-    if code > 128:
+    if code < 0:
+        say(f"ended by signal {-code}" + (": out of memory?" if -code == signal.SIGKILL else ""))
+        code = 128 - code
+    elif code > 128:
         say("stopped; the same command goes on here")
     if code:
         sys.exit(code)

@@ -136,8 +136,8 @@ def keep_identity(plan: Plan, described: Mapping[str, Any]) -> None:
     """
     path = plan.out / PLAN
     if path.is_file() and not any(plan.out.glob(f"learned/*/*/{PLAN}")):
-        stored = read_json(path)
-        write_json(path, {**described, "scenes": stored["scenes"], "views": stored["views"]})
+        fixed = {key: value for key, value in read_json(path).items() if key in ("scenes", "views")}
+        write_json(path, {**described, **fixed})
     keep_plan(plan.out, described, EPISODES)
 
 

@@ -17,7 +17,7 @@ from persist_cli.api.memory import Memory
 from persist_cli.api.memory_file import read_header
 from persist_cli.api.observations import TrajectoryInfo
 from persist_cli.api.scene import Scene
-from persist_cli.checkpoints.load import adapter_memory, check_noise, empty_backbone, load_backbone
+from persist_cli.checkpoints.load import adapter_memory, check_noise, check_video_model, empty_backbone, load_backbone
 from persist_cli.data.clips import check_size
 from persist_cli.data.reference import parse_reference
 from persist_cli.errors import CheckpointError
@@ -123,6 +123,7 @@ def world_with(
     Raises:
         PersistError: when model, sampling and data do not go together.
     """
+    check_video_model(checkpoint)
     empty, sampling = empty_backbone(checkpoint), checkpoint.sampling_with(options.sampling)
     check_size(info, empty.image_size, options.start)
     empty.check_sampling(sampling)

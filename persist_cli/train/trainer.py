@@ -12,6 +12,7 @@ from accelerate import Accelerator
 from persist_cli.api.backbone import Backbone, Clips
 from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.checkpoints.lineage import Lineage, save_stage_recipes
+from persist_cli.checkpoints.load import trains_codec_alone
 from persist_cli.checkpoints.save import save_adapter, save_base, save_lora
 from persist_cli.data.augment import Augmentation
 from persist_cli.data.cameras import vertical_view
@@ -99,7 +100,7 @@ class Trainer(TrainingLoop[Backbone]):
         elif recipe.lora is not None:
             save_lora(model, lineage.base, folder, home, lineage.scenes)
         else:
-            save_base(model, folder, lineage.scenes, lineage.base, home)
+            save_base(model, folder, lineage.scenes, lineage.base, home, trains_codec_alone(recipe, lineage.base))
 
     def figures(self) -> dict[str, Any]:
         """What the cache did."""

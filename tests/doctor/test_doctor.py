@@ -18,7 +18,7 @@ from persist_cli.api.clips import ClipLatents
 from persist_cli.doctor import doctor as doctor_module
 from persist_cli.doctor.changes import CHECKPOINTING, EIGHT_BIT, FROZEN, LORA, OFFLOAD, Strategy, strategies
 from persist_cli.doctor.doctor import Doctor, _verdict, launch_command
-from persist_cli.doctor.machine import GIB, Machine, machine_of
+from persist_cli.doctor.machine import GIB, Machine, machine_of, memory_here
 from persist_cli.doctor.memory_estimate import Launch
 from persist_cli.doctor.meta_model import MetaModel, build_meta_model
 from persist_cli.doctor.step import Encoding, ShallowCopies, StepKind
@@ -363,3 +363,14 @@ def test_the_memory_of_this_machine_is_known_without_what_windows_lacks(monkeypa
     machine = machine_of(None, None)
     assert (machine.kind, machine.devices) == ("cpu", 1)
     assert machine.memory == pytest.approx(whole, rel=0.01)
+
+
+def test_the_memory_of_a_batch_job_is_that_of_its_control_group(tmp_path):
+    job = tmp_path / "groups/slurm/job_7"
+    job.mkdir(parents=True)
+    (tmp_path / "cgroup").write_text("0::/slurm/job_7/step\n")
+    (job / "memory.max").write_text("max\n")
+    whole = memory_here(tmp_path / "cgroup", tmp_path / "groups")
+    (job.parent / "memory.max").write_text("1000000\n")
+    assert whole > memory_here(tmp_path / "cgroup", tmp_path / "groups") == 1_000_000
+    assert memory_here(tmp_path / "nowhere", tmp_path / "groups") == whole

@@ -93,3 +93,16 @@ def test_commands_that_go_on_in_a_folder_have_it_alone(elsewhere, persist, tmp_p
     why = "another command is writing there; wait until it has ended, or choose another --out"
     assert (refused.code, refused.err) == (1, f"error: {tmp_path}/run: {why}\n")
     assert [path.name for path in (tmp_path / "run").iterdir()] == [LOCK]
+
+
+def test_another_users_lock_is_neither_ignored_nor_removed(elsewhere, tmp_path, monkeypatch):
+    def refuse(self):
+        raise PermissionError(13, "Permission denied", str(tmp_path / "run" / LOCK))
+
+    monkeypatch.setattr("filelock.FileLock._acquire", refuse)
+    with (
+        pytest.raises(PersistError, match="another user's; wait until that command has ended"),
+        exclusive(tmp_path / "run"),
+    ):
+        pytest.fail("two have it")
+    assert (tmp_path / "run" / LOCK).exists()

@@ -56,3 +56,23 @@ def test_a_codec_takes_no_savings_of_the_video_model(persist, walks, tmp_path, n
     result = persist(*stage("codec", walks, tmp_path / "out", f"training.{name}=true"))
     assert (result.code, result.err.count("\n")) == (1, 1)
     assert f"training.{name}: of the video model, which stage codec does not train" in result.err
+
+
+def test_a_codec_that_was_trained_on_from_a_codec_is_one_alone_too(persist, walks, codec, tmp_path):
+    again = tmp_path / "codec"
+    assert persist(*stage("codec", walks, again, f"base={codec}", "training.steps=1")).code == 0
+    result = persist(*stage("stage2-voxel", walks, tmp_path / "out", f"base={again}"))
+    assert result.code == 1
+    assert "a codec alone, whose video model was not trained" in result.err
+
+
+@pytest.mark.parametrize("command", ["rollout", "eval"])
+def test_a_codec_alone_imagines_nothing(persist, walks, codec, tmp_path, command):
+    asked = {
+        "rollout": ("--start", f"{walks}#0:0", "--actions", "left"),
+        "eval": ("--data", walks, "--allow-training-scenes"),
+    }[command]
+    result = persist(command, codec, *asked, "--out", tmp_path / "out")
+    assert result.code == 1
+    assert "a codec alone, whose video model was not trained" in result.err
+    assert "a codec alone" in persist("inspect", codec).out

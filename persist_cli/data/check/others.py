@@ -4,7 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from persist_cli.api.checkpoint import CARD, GUIDE, POLICY_CARD, SCENE_CARD, STEP, checkpoint_folder, find_checkpoint
+from persist_cli.api.checkpoint import (
+    CARD,
+    CODEC_ALONE,
+    GUIDE,
+    POLICY_CARD,
+    SCENE_CARD,
+    STEP,
+    checkpoint_folder,
+    find_checkpoint,
+    read_card,
+)
 from persist_cli.api.memory_file import is_memory_file, read_header
 from persist_cli.io.command_line import quoted
 from persist_cli.io.files import read_json
@@ -67,6 +77,8 @@ def _describe_checkpoint(path: Path) -> str:
     adapters, word = ", ".join(checkpoint.adapters), quoted(path)
     parts = f"adapters {adapters}" if adapters else "no memory adapter"
     guide = ", a guide" * (checkpoint.base_folder / GUIDE).is_dir()
+    if read_card(checkpoint.base_folder).get(CODEC_ALONE):
+        return f"{kind}: backbone {checkpoint.backbone}, a codec alone, for `persist finetune RECIPE … base={word}`"
     return (
         f"{kind}: backbone {checkpoint.backbone}, {parts}{guide}; "
         f"`persist rollout {word} --start DATA#0:0` rolls it out, `persist eval {word} --data DATA` measures it"
