@@ -86,6 +86,7 @@ NOT_RUN = {
     "make ": "a target of the Makefile, which the tests of demos, tables and benchmarks hold to",
     "python -m persist_cli.reproduce": "trains for hours, which tests/reproduce hold to",
     "git ": "changes the checkout that is tested",
+    "cd persist": "see git",
     "sudo ": "needs a package manager",
     "apt ": "needs a package manager",
     "python3 -m venv": "the environment of the tests is there",

@@ -15,6 +15,7 @@ from persist_cli.api.checkpoint import step_folders
 from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import file_sha256, read_json, write_json
+from persist_cli.io.sha256sums import check_sums
 
 VERSION: Final = 1
 
@@ -93,6 +94,7 @@ def find_card(kind: CardKind, path: Path) -> NetworkCard:
     folder = card_folder(kind, path)
     if folder is None:
         raise CheckpointError(f"{path}: no {kind.network} there (no {kind.file}); train one: {kind.train}")
+    check_sums(folder, lambda name: name == kind.file)  # the weights are verified when they are loaded
     card = read_json(folder / kind.file)
     if not isinstance(card, dict) or card.get("format") != kind.format or card.get("version") != VERSION:
         raise CheckpointError(f"{folder / kind.file}: not the card of a {kind.network} of version {VERSION}")

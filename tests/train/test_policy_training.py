@@ -9,6 +9,7 @@ import pytest
 
 from persist_cli.api.checkpoint import step_folders
 from persist_cli.api.training_scenes import TrainingScenes
+from persist_cli.errors import CheckpointError
 from persist_cli.io.files import read_tensors
 from persist_cli.policies.trained import find_policy
 from persist_cli.recipe import make_recipe, read_recipe
@@ -122,3 +123,11 @@ def test_a_policy_has_no_cache_and_a_recipe_of_it_no_plan_of_memory(persist, wal
     ended = persist(*policy_stage(walks, tmp_path / "run", "--cache", str(tmp_path / "cache")))
     assert (ended.code, "leave it out" in ended.err) == (1, True)
     assert persist("doctor", "houses-64-policy").code == 1
+
+
+def test_a_card_that_was_changed_is_refused_before_the_weights_are_read(policy_run, tmp_path):
+    folder = shutil.copytree(find_policy(policy_run).folder, tmp_path / "policy")
+    card = folder / "policy.json"
+    card.write_text(card.read_text().replace('"fingerprint": "', '"fingerprint": "0'))
+    with pytest.raises(CheckpointError, match=r"policy\.json"):
+        find_policy(folder)
