@@ -165,6 +165,7 @@ def test_a_renderers_scenes_are_also_those_of_the_model_that_imagines_for_it(
         shutil.copytree(folder, tmp_path / name)
     without_sums(next((tmp_path / "run").glob("step-*")) / "model")
     trained = find_scene_model(tmp_path / "scene")
+    without_sums(trained.folder)
     write_scene_card(tmp_path / "scene", trained.plugin, trained.settings, trained.stage, scenes)
     memory = find_checkpoint(tmp_path / "run").adapter_folder("scene") / "memory.json"
     values = json.loads(memory.read_text())
