@@ -50,8 +50,7 @@ class Surfaces:
 
     def colors(self, grid: CellGrid) -> UInt8[Tensor, "layer frame height width 3"]:
         """Return the colour of each surface's cell, and black where there is none."""
-        found = grid.colors.flatten(0, 2)[self.cells.clamp(min=0)]
-        return torch.where(self.hit[..., None], found, torch.zeros_like(found))
+        return grid.colors.flatten(0, 2)[self.cells.clamp(min=0)] * self.hit[..., None]
 
 
 def first_surfaces(

@@ -72,7 +72,11 @@ class Plan:
 
     def all_recipes(self) -> dict[str, Recipe]:
         """The recipes by name, with the further settings."""
-        return {name: make_recipe(apply_overrides(read_recipe(name), self.settings), name) for name in self.recipes}
+        return {name: self.recipe(name) for name in self.recipes}
+
+    def recipe(self, name: str) -> Recipe:
+        """A recipe with the further settings, which all trials of a folder have."""
+        return make_recipe(apply_overrides(read_recipe(name), self.settings), name)
 
 
 @dataclass(frozen=True)
@@ -240,9 +244,8 @@ def points_of(plan: Plan) -> Iterator[Point]:
         name, _, number = file.parent.name.rpartition("-")
         found.setdefault(name, []).append(int(number))
     for name in found:
-        recipe = make_recipe(read_recipe(name), name)
         for samples in sorted(found[name]):
-            yield read_point(plan, name, recipe, samples)
+            yield read_point(plan, name, plan.recipe(name), samples)
 
 
 def write_results(plan: Plan, left_out: dict[str, str]) -> None:

@@ -27,17 +27,14 @@ def run_command(command: Sequence[str]) -> int:
         the exit code; after a signal that asked this process to stop, 128 and the signal's number.
     """
     stops: list[int] = []
-    running: list[subprocess.Popen[bytes]] = []
 
     def stop(number: int, frame: FrameType | None) -> None:
         stops.append(number)
         if number != signal.SIGINT:
-            for process in running:
-                process.send_signal(number)
+            process.send_signal(number)
 
-    with caught_signals(stop):  # a child does not inherit it
-        running.append(subprocess.Popen(command))
-        code = running[0].wait()
+    with subprocess.Popen(command) as process, caught_signals(stop):
+        code = process.wait()
     return 128 + stops[0] if stops else code
 
 

@@ -106,8 +106,9 @@ class Reached:
                 continue
             offset = self._middle(thing.cells) - place
             distance, radius = float(offset.norm()), float(span[:2].max()) / 2
-            if distance < REACH + radius and float(offset @ ahead) > AHEAD * distance and self._in_sight(thing, offset):
-                near += [] if self._holds_another(thing) else [(distance, thing.name, thing)]
+            in_reach = distance < REACH + radius and float(offset @ ahead) > AHEAD * distance
+            if in_reach and self._in_sight(thing, offset) and not self._holds_another(thing):
+                near.append((distance, thing.name, thing))
         return min(near, key=lambda one: one[:2])[2] if near else None
 
     def pick_up(self) -> Load | None:
