@@ -31,7 +31,7 @@ from persist_cli.cli.options import (
 
 planning_app = typer.Typer()
 
-IMAGINING = "checkpoint adapter steps sampler guidance context_noise autoguidance dtype save_memory"  # options of it
+OF_THE_MODEL = "checkpoint adapter steps sampler guidance context_noise autoguidance dtype save_memory"  # in `learn`
 
 
 MethodOption = Annotated[str, typer.Option(help="rank: a policy proposes; cem: the best of a round lead the next.")]
@@ -145,4 +145,6 @@ def _refuse_unused(context: typer.Context, episodes: Path | None, inside: str) -
     if episodes is None:
         refuse_options(context, "patience stop_cost", "only with --episodes, which are run so")
     if inside == "simulator":
-        refuse_options(context, IMAGINING, "the true house needs no model and no memory; leave out --inside simulator")
+        refuse_options(
+            context, OF_THE_MODEL, "the true house needs no model and no memory; leave out --inside simulator"
+        )

@@ -79,7 +79,7 @@ def memory_here(proc: Path = Path("/proc/self/cgroup"), groups: Path = Path("/sy
         own = next((line[3:] for line in proc.read_text().splitlines() if line.startswith("0::")), "/")
         group = groups / own.strip("/")
         for folder in (group, *group.parents):
-            limit = folder / "memory.max"
-            if folder.is_relative_to(groups) and limit.is_file() and limit.read_text().strip().isdigit():
-                limits.append(int(limit.read_text()))
+            file = folder / "memory.max"
+            limit = file.read_text().strip() if folder.is_relative_to(groups) and file.is_file() else ""
+            limits += [int(limit)] if limit.isdigit() else []
     return min(limits)

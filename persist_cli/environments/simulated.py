@@ -163,6 +163,7 @@ class OpenHouse:
         for _ in range(TRIES if far else 0):
             place, heading = far[int(draws.integers(len(far)))], float(draws.uniform(-math.pi, math.pi))
             is_open = clear_distance(self.simulator, place, heading, OPEN_VIEW, OPEN_VIEW)
+            # the straight line may be shorter than the grid's way, and is looked at for the drawn place alone
             if is_open and (straight or self.task.is_far_enough(geodesic.metres(place))):
                 return Stand(place, heading)
         return None

@@ -37,7 +37,7 @@ class Drift(DepthMetric):
         truth = in_own_frame(prediction.truth)
         known = on_grid(truth.depth, PROBE_GRID) > 0
         there = fuse(truth)
-        if not bool(known.any()) or not len(there):
+        if not len(there):
             return torch.full((len(truth),), math.nan, dtype=torch.float64)
         points = on_grid(unproject(prediction.depth.cpu(), truth.cameras), PROBE_GRID)
         tree = _tree(there)

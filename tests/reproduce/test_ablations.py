@@ -131,6 +131,16 @@ def measured(plan: Plan, name: str, samples: int) -> None:
     (folder / "metrics.json").write_text(json.dumps(results))
 
 
+def test_figures_of_earlier_trials_stay_and_have_the_settings_of_their_folder(tmp_path):
+    plan = dataclasses.replace(PLAN, out=tmp_path, recipes=(PREFIX,), settings=("training.batch=4",))
+    measured(plan, f"{PREFIX}-absolute", 1000)
+    measured(plan, PREFIX, 1000)
+    write_results(plan, {})
+    values = json.loads((tmp_path / "ablations.json").read_text())
+    assert [(point["recipe"], point["steps"]) for point in values["points"]] == [
+        (PREFIX, 250), (f"{PREFIX}-absolute", 250)]  # fmt: skip
+
+
 def test_the_table_and_the_curves_say_what_was_measured_and_what_was_left_out(tmp_path):
     plan = dataclasses.replace(PLAN, out=tmp_path, recipes=(PREFIX, f"{PREFIX}-clip"))
     measured(plan, PREFIX, 1000)
