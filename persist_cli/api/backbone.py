@@ -6,7 +6,6 @@ import dataclasses
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -20,39 +19,12 @@ from persist_cli.api.clips import ClipLatents as ClipLatents
 from persist_cli.api.clips import Clips as Clips
 from persist_cli.api.clips import Interactions as Interactions
 from persist_cli.api.inference import InferenceOptions
+from persist_cli.api.inference import Sampling as Sampling
 from persist_cli.api.stages import Adversarial, Distill, Lora, MemorySavings, ParameterGroup, Stage
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError, PersistError
 from persist_cli.io.setting_docs import Setting
 from persist_cli.io.settings import NoSettings
-
-
-@dataclass(frozen=True)
-class Sampling:
-    """Settings by which clips are sampled.
-
-    Args:
-        steps: number of denoising steps, at least 1.
-        sampler: name of one of the backbone's samplers.
-        memory_guidance: weight of classifier-free guidance over memory, at least 0; 1 means none.
-        context_noise: noise level that given frame and memory are declared to have, at least 0; each at most that of
-            its training. Nothing is added.
-        autoguidance: weight of guidance away from the checkpoint's guide, a weaker version of the video model, at the
-            noisier half of the noise levels, at least 1; 1 means none (https://arxiv.org/abs/2406.02507).
-    """
-
-    steps: int = 50
-    sampler: str = "ddim"
-    memory_guidance: float = 1.0
-    context_noise: float = 0.0
-    autoguidance: float = 1.0
-
-    @property
-    def words(self) -> str:
-        """These settings in a few words, as in ``4 steps of unipc with guidance 1.5``."""
-        words = f"{self.steps} step{'s' * (self.steps != 1)} of {self.sampler} with guidance {self.memory_guidance:g}"
-        noise = f" and context noise {self.context_noise:g}" * (self.context_noise > 0)
-        return words + noise + f" and autoguidance {self.autoguidance:g}" * (self.autoguidance != 1)
 
 
 class Backbone(nn.Module, ABC):
@@ -107,16 +79,7 @@ class Backbone(nn.Module, ABC):
         """Raise ``PersistError`` with one line when ``generate`` cannot sample with these settings."""
         if sampling.sampler not in self.samplers:
             raise PersistError(f"unknown sampler {sampling.sampler!r}; known: {', '.join(self.samplers)}")
-        if sampling.steps < 1:
-            raise PersistError(f"{sampling.steps} denoising steps; it must be at least 1")
-        if not 0 <= sampling.memory_guidance < math.inf:
-            raise PersistError(f"guidance over memory of {sampling.memory_guidance}; it must be a number of at least 0")
-        if not 0 <= sampling.context_noise < math.inf:
-            raise PersistError(f"context noise of {sampling.context_noise}; it must be a number of at least 0")
-        if not 1 <= sampling.autoguidance < math.inf:
-            raise PersistError(
-                f"autoguidance of {sampling.autoguidance}; it must be a number of at least 1; 1 means none"
-            )
+        sampling.check()
         if sampling.autoguidance != 1 and self.guide_folder is None:
             raise PersistError(
                 f"autoguidance of {sampling.autoguidance:g}: this checkpoint has no guide; persist export --guide "

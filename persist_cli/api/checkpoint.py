@@ -12,17 +12,14 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-from persist_cli.api.inference import SamplingOverrides
+from persist_cli.api.inference import Sampling, SamplingOverrides
 from persist_cli.api.training_scenes import TrainingScenes
-from persist_cli.errors import CheckpointError, nearest_name
+from persist_cli.errors import CheckpointError, PersistError, nearest_name
 from persist_cli.io.command_line import quoted
 from persist_cli.io.files import bundled_folder, read_json
 from persist_cli.io.sha256sums import check_sums
-
-if TYPE_CHECKING:
-    from persist_cli.api.backbone import Sampling
 
 CARD: Final = "persist.json"
 POLICY_CARD: Final = "policy.json"  # of a trained policy, which is no world model
@@ -118,8 +115,6 @@ class Checkpoint:
             overrides: settings to use instead.
             protocol: name of a protocol of evaluation, for which the card may have settings of its own.
         """
-        from persist_cli.api.backbone import Sampling
-
         default = self.protocol_sampling.get(protocol) or self.sampling or Sampling()
         return dataclasses.replace(default, **overrides.requested())
 
@@ -363,16 +358,17 @@ def _protocol_sampling(card: dict[str, Any], path: Path) -> dict[str, Sampling]:
 
 def _sampling(value: Any, path: Path) -> Sampling:
     """Return the sampling settings that are JSON values of a card."""
-    from persist_cli.api.backbone import Sampling
-
-    valid = isinstance(value, dict) and all(type(item) in SAMPLING_TYPES.get(key, ()) for key, item in value.items())
-    least = {"steps": 1, "memory_guidance": 0, "context_noise": 0, "autoguidance": 1}
-    if not valid or not all(low <= value.get(name, 1) < float("inf") for name, low in least.items()):
+    if not isinstance(value, dict) or any(type(item) not in SAMPLING_TYPES.get(key, ()) for key, item in value.items()):
         raise CheckpointError(
-            f"{path}: its sampling is {value}; it holds steps, at least 1, the name of a sampler, memory_guidance and "
-            "context_noise, at least 0, and autoguidance, at least 1"
+            f"{path}: its sampling is {value}; it may hold {', '.join(SAMPLING_TYPES)}: "
+            "numbers, and the name of a sampler"
         )
-    return Sampling(**value)
+    sampling = Sampling(**value)
+    try:
+        sampling.check()
+    except PersistError as error:
+        raise CheckpointError(f"{path}: its sampling is {value}: {error}") from error
+    return sampling
 
 
 def _training_scenes(card: dict[str, Any], path: Path) -> TrainingScenes | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Self, get_args
@@ -82,6 +83,47 @@ class InferenceOptions:
 
 CONSISTENCY = "consistency"  # the sampler of distilled models
 PROTOCOLS = ("revisit", "later", "return", "long", "unseen")  # of evaluation; a card may have a sampling for each
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """Settings by which clips are sampled.
+
+    Args:
+        steps: number of denoising steps, at least 1.
+        sampler: name of one of the backbone's samplers.
+        memory_guidance: weight of classifier-free guidance over memory, at least 0; 1 means none.
+        context_noise: noise level that given frame and memory are declared to have, at least 0; each at most that of
+            its training. Nothing is added.
+        autoguidance: weight of guidance away from the checkpoint's guide, a weaker version of the video model, at the
+            noisier half of the noise levels, at least 1; 1 means none (https://arxiv.org/abs/2406.02507).
+    """
+
+    steps: int = 50
+    sampler: str = "ddim"
+    memory_guidance: float = 1.0
+    context_noise: float = 0.0
+    autoguidance: float = 1.0
+
+    @property
+    def words(self) -> str:
+        """These settings in a few words, as in ``4 steps of unipc with guidance 1.5``."""
+        words = f"{self.steps} step{'s' * (self.steps != 1)} of {self.sampler} with guidance {self.memory_guidance:g}"
+        noise = f" and context noise {self.context_noise:g}" * (self.context_noise > 0)
+        return words + noise + f" and autoguidance {self.autoguidance:g}" * (self.autoguidance != 1)
+
+    def check(self) -> None:
+        """Raise ``PersistError`` with one line for a number that is not in its range."""
+        if self.steps < 1:
+            raise PersistError(f"{self.steps} denoising steps; it must be at least 1")
+        weights = {
+            "guidance over memory": (self.memory_guidance, 0),
+            "context noise": (self.context_noise, 0),
+            "autoguidance": (self.autoguidance, 1),
+        }
+        for name, (weight, least) in weights.items():
+            if not least <= weight < math.inf:
+                raise PersistError(f"{name} of {weight}; it must be a number of at least {least}")
 
 
 @dataclass(frozen=True)

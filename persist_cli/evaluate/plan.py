@@ -9,9 +9,8 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from persist_cli.api.backbone import Sampling
 from persist_cli.api.checkpoint import Checkpoint, find_checkpoint
-from persist_cli.api.inference import InferenceOptions, SamplingOverrides
+from persist_cli.api.inference import InferenceOptions, Sampling, SamplingOverrides
 from persist_cli.checkpoints.contamination import ALLOW, OTHER_DATA, scenes_to_avoid
 from persist_cli.checkpoints.lineage import training_scenes
 from persist_cli.checkpoints.placement import check_placement

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from persist_cli.api.actions import Action
-from persist_cli.api.backbone import Sampling
+from persist_cli.api.inference import Sampling
 from persist_cli.api.observations import Observations, Origin, Trajectory, TrajectoryInfo
 from persist_cli.api.policy import Goal
 from persist_cli.errors import PersistError

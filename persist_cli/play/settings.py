@@ -11,6 +11,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from persist_cli.api.ground import ground_axes
+from persist_cli.api.inference import Sampling
 from persist_cli.errors import PersistError
 
 Picture = UInt8[Tensor, "height width 3"]
@@ -47,12 +48,7 @@ class PlaySettings:
     growing: bool = True
 
     def __post_init__(self) -> None:
-        if self.steps < 1:
-            raise PersistError(f"{self.steps} denoising steps; it must be at least 1")
-        if not 0 <= self.guidance < math.inf:
-            raise PersistError(f"guidance over memory of {self.guidance}; it must be a number of at least 0")
-        if not 1 <= self.autoguidance < math.inf:
-            raise PersistError(f"autoguidance of {self.autoguidance}; it must be a number of at least 1")
+        Sampling(self.steps, memory_guidance=self.guidance, autoguidance=self.autoguidance).check()
         if self.seed < 0:
             raise PersistError(f"seed {self.seed}; it must be at least 0")
 

@@ -23,7 +23,7 @@ from typing import Any, Final
 
 import yaml
 
-from persist_cli.api.backbone import Sampling
+from persist_cli.api.inference import Sampling
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError, PersistError, hint
 from persist_cli.evaluate.report.result_file import read_results

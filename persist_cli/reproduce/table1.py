@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from persist_cli.api.backbone import Sampling
+from persist_cli.api.inference import Sampling
 from persist_cli.reproduce import choose
 from persist_cli.reproduce.commands import COLLECT, run_line, run_main
 from persist_cli.reproduce.trial import CLIPS, STEPS, run_small, trial_folder

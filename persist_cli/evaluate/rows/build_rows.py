@@ -6,8 +6,8 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from persist_cli.api.backbone import Sampling
 from persist_cli.api.checkpoint import PLAIN, Checkpoint
+from persist_cli.api.inference import Sampling
 from persist_cli.api.memory import Memory
 from persist_cli.errors import CheckpointError, DataError, PersistError, hint
 from persist_cli.evaluate.cases import Case
