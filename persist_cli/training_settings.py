@@ -63,7 +63,7 @@ class TrainingSettings:
     steps: Changeable[Positive] = 1000
     batch: Positive = 16
     accumulation: Changeable[Positive] = 1
-    learning_rate: PositiveNumber = 1e-4
+    learning_rate: Annotated[float, Field(gt=0, le=1000)] = 1e-4
     warmup: Count = 50
     cooldown: Changeable[Count] = 0
     schedule: Literal["constant", "cosine"] = "constant"

@@ -128,7 +128,7 @@ def test_autoguidance_on_a_card_is_at_least_1(persist, model, tmp_path):
     values = json.loads(card.read_text())
     card.write_text(json.dumps(values | {"sampling": values["sampling"] | {"autoguidance": 0.5}}))
     ended = persist("inspect", tmp_path / "m")
-    assert (ended.code, "and autoguidance, at least 1" in ended.err) == (1, True), ended.err
+    assert (ended.code, "autoguidance of 0.5; it must be a number of at least 1" in ended.err) == (1, True), ended.err
 
 
 def refused(persist, runs, *arguments):

@@ -51,6 +51,13 @@ def test_weights_are_exact_binary_fractions_fixed_by_the_seed():
     assert not torch.equal(weight, projection(PatchesSettings(seed=4)))
 
 
+@pytest.mark.parametrize("name", ["patches", "random-vit"])
+@pytest.mark.parametrize("seed", [-1, 2**32])
+def test_a_seed_out_of_its_range_is_refused(name, seed):
+    with pytest.raises(RecipeError, match=f"seed must be a whole number of at least 0 and below {2**32}, not {seed}"):
+        make_encoder(name, {"seed": seed})
+
+
 def test_detail_channels_are_orthogonal_to_each_other_and_to_colour():
     weight = projection(PatchesSettings())
     gram = weight.T @ weight

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float, UInt8
-from pydantic import PositiveInt
+from pydantic import Field, PositiveInt
 from torch import Tensor
 
 from persist_cli.api.encoder import Encoder
@@ -30,7 +31,7 @@ class PatchesSettings:
 
     patch: PositiveInt = 8
     channels: PositiveInt = 32
-    seed: int = 0
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
 
 
 class Patches(Encoder):

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Float
-from pydantic import NonNegativeInt
+from pydantic import Field
 from torch import Tensor
 
 from persist_memory.encoders.dinov2 import IMAGENET_MEAN, IMAGENET_STD
@@ -24,7 +24,7 @@ class RandomVitSettings(TransformerSettings):
         seed: seed of the weights. One seed gives the same weights with the same version of torch and transformers.
     """
 
-    seed: NonNegativeInt = 0
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
 
 
 class RandomVit(VisionTransformer):
