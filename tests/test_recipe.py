@@ -81,8 +81,9 @@ def test_an_error_in_a_recipe_is_one_line(overrides, cause):
 @pytest.mark.parametrize(
     "override",
     ["steps=0", "batch=0", "accumulation=0", "learning_rate=0", "learning_rate=.inf", "learning_rate=.nan",
-     "learning_rate=1.0e+300", "warmup=-1", "cooldown=-1", "weight_decay=-1", "clip=0", "ema=1", "ema=.nan", "seed=-1", "seed=4294967296",
-     "checkpoint_every=0", "checkpoint_minutes=-1", "checkpoint_minutes=.nan", "workers=-1", "threads=-1"],
+     "learning_rate=1.0e+300", "warmup=-1", "cooldown=-1", "weight_decay=-1", "clip=0", "ema=1", "ema=.nan", "seed=-1",
+     "seed=4294967296", "checkpoint_every=0", "checkpoint_minutes=-1", "checkpoint_minutes=.nan", "workers=-1",
+     "threads=-1"],
 )  # fmt: skip
 def test_a_setting_out_of_its_range_is_named(override):
     with pytest.raises(RecipeError, match=f"training.{override.split('=')[0]} must be a "):
