@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from persist_cli.api.checkpoint import Checkpoint, lora_base
-from persist_cli.checkpoints.load import changed_settings, is_codec_alone, load_backbone
+from persist_cli.checkpoints.load import changed_settings, check_video_model, load_backbone
 from persist_cli.errors import CheckpointError
 from persist_cli.io.checksums import tensor_checksum
 from persist_cli.io.files import read_tensors
@@ -19,7 +19,7 @@ def check_guide(guide: Checkpoint, base: Checkpoint) -> None:
     """Check whether the video model of a checkpoint can guide that of a base.
 
     Raises:
-        CheckpointError: when it has other sizes, inputs or outputs, or another codec.
+        CheckpointError: when it has no trained video model, other sizes, inputs or outputs, or another codec.
     """
     place, kind = guide.folder, load_plugin("backbone", base.backbone)
     if not kind.video_model:
@@ -28,8 +28,7 @@ def check_guide(guide: Checkpoint, base: Checkpoint) -> None:
         raise CheckpointError(f"{place}: of backbone {guide.backbone!r}; its base is of {base.backbone!r}")
     if lora_base(guide.base_folder) is not None:
         raise CheckpointError(f"{place}: LoRA on another base; export it, and name that export as the guide")
-    if is_codec_alone(guide):
-        raise CheckpointError(f"{place}: a codec alone, whose video model was not trained; it cannot guide")
+    check_video_model(guide)
     with busy("comparing the guide with its base"):
         settings, encoding = _settings_and_codec(guide)
         own = load_backbone(base)

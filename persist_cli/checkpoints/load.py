@@ -196,20 +196,17 @@ def start_backbone(recipe: Recipe, base: Checkpoint | None) -> Backbone:
         base: the checkpoint that the training starts from.
 
     Raises:
-        RecipeError: when the base is of another backbone than the recipe's, was built by other settings, or has no
-            trained video model for a memory or LoRA to be trained on.
+        RecipeError: when the base is of another backbone than the recipe's, or was built by other settings.
+        CheckpointError: when it has no trained video model for a memory or LoRA to be trained on.
     """
     config = recipe.backbone
     if base is None:
         return make_backbone(config.name, config.settings)
     if base.backbone != config.name:
         raise RecipeError(f"base {base.folder} is of backbone {base.backbone!r}, not {config.name!r}")
-    codec_alone = is_codec_alone(base)
-    if codec_alone and (recipe.memory is not None or recipe.lora is not None):
-        raise RecipeError(
-            f"base {base.folder}: a codec alone, whose video model was not trained; train stage 1 on it, and name that"
-        )
-    if codec_alone and recipe.stage == "1":
+    if recipe.memory is not None or recipe.lora is not None:
+        check_video_model(base)
+    if recipe.stage == "1" and is_codec_alone(base):
         return fresh_on_codec(base, config.settings)
     built_by = load_plugin("backbone", config.name).built_by
     changed = changed_settings(base.settings, {key: config.settings[key] for key in built_by if key in config.settings})
