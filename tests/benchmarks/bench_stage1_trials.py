@@ -35,6 +35,7 @@ TRIALS = {
     "uniform": "backbone.settings.weighting=uniform",
     "equal-channels": "backbone.settings.channel_weights=equal",
     "given-alone": "backbone.settings.given=alone",
+    "colours-alone": "backbone.settings.given=alone backbone.settings.depth=false",
     "adamw": "training.optimizer=adamw training.learning_rate=1e-3",
     "six-layers": "backbone.settings.transformer.num_layers=6",
     "clips-of-9": "data.clip_frames=[9]",
