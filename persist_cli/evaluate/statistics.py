@@ -35,15 +35,16 @@ LEAST_UNITS = 6
 Below six no test of paired differences that makes no assumption about their distribution can be significant: n
 differences of one sign have a two-sided probability of 2 / 2ⁿ under no effect (sign test, signed-rank test), 0.0625 for
 five and 0.031 for six. The percentile bootstrap does not know this and gives an interval even for two, far too narrow.
-In 4,000 draws of normal values the 95 % interval held the true mean in 75 % of them for three scenes, 87 % for five,
-89 % for six, 92 % for ten, 93 % for 16 and 94 % for 32.
+In 4,000 draws of normal values the 95 % interval held the true mean in 75 % of them for three scenes, 86 % for five,
+88 % for six, 91 % for ten, 93 % for 16 and 94 % for 32 (``tests/benchmarks/bench_intervals.py``).
 """
 
 LEAST_MODELS = 3
 """Fewest training seeds behind a claim about a memory.
 
 The interval of a row with three takes the spread between them into account, and is still narrow: two rows of three
-models each that differ by chance alone had an interval that left zero out in 13 % of 4,000 draws, not in 5 %.
+models each that differ by chance alone had an interval that left zero out in 13 % of 4,000 draws, not in 5 % (the same
+benchmark).
 """
 
 Array = NDArray[np.float64]
