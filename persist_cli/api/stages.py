@@ -54,7 +54,8 @@ class Distill:
     """The distillation of a trained model to one or two denoising steps, in stages 1 and 2.
 
     Consistency distillation (Song et al., 2303.01469): between two neighbouring noise levels the teacher makes one
-    step, and the student learns to predict the same clean clip on both sides of it.
+    step, and the student learns to predict the same clean clip on both sides of it. The errors of all channels and
+    noise levels count alike: a backbone's weights of them are for denoising.
 
     Args:
         teacher: checkpoint whose denoising is learned, such as ``reference`` or ``reference#voxel``; null for the

@@ -27,7 +27,8 @@ from persist_cli.navigation.ground_mapper import GroundMapper, body_of, knows_fl
 from persist_cli.navigation.routes import check_within_reach
 from persist_cli.rollout.camera_path import walking_vocabulary
 from persist_cli.rollout.open_world import WorldOptions, assemble_world
-from persist_cli.rollout.world_model import SEEDS, Agent, WorldModel
+from persist_cli.rollout.seeds import SEEDS
+from persist_cli.rollout.world_model import Agent, WorldModel
 
 NAME: Final = "persist/ImaginedHouse-v0"
 

@@ -27,7 +27,8 @@ from persist_cli.planning.approach import best_approach
 from persist_cli.planning.futures import FutureModel, Over, SimulatorFutures, WorldFutures
 from persist_cli.planning.judge import Budget, Judge
 from persist_cli.planning.planners import Cem, CemSettings, Planner, Rank, RankSettings
-from persist_cli.rollout.world_model import SEEDS, Agent, WorldModel
+from persist_cli.rollout.seeds import SEEDS, nth_seed
+from persist_cli.rollout.world_model import Agent, WorldModel
 
 APPROACH = 8  # actions of the ways that are compared before an agent stops
 
@@ -216,7 +217,7 @@ class Navigator:
         """Return the next actions where the goal is not recognised."""
         begun = time.monotonic()
         self.least = math.inf
-        generator = torch.Generator().manual_seed(self.seed * DECISIONS + self.decisions)
+        generator = torch.Generator().manual_seed(nth_seed(self.seed, self.decisions, DECISIONS))
         situation = Situation(self.seen, self.info, self.goal, self.ground.map())
         self.decisions += 1
         with torch.no_grad():

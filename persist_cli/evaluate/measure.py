@@ -17,7 +17,7 @@ from persist_cli.evaluate.plan import Evaluation
 from persist_cli.evaluate.processes import Processes
 from persist_cli.evaluate.rows.row import Row
 from persist_cli.output.console import add_task, busy, progress
-from persist_cli.rollout.world_model import clip_seed
+from persist_cli.rollout.seeds import clip_seed
 
 SHEET_CLIPS = 3  # clips whose videos are kept of every row, for the contact sheets
 

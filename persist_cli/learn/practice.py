@@ -26,7 +26,7 @@ from persist_cli.navigation.ground_mapper import GroundMapper
 from persist_cli.planning.futures import PoseFutures
 from persist_cli.planning.judge import Judge
 from persist_cli.plugins import make_cost
-from persist_cli.rollout.world_model import SEEDS
+from persist_cli.rollout.seeds import SEEDS
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ import copy
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -28,9 +28,8 @@ from persist_cli.api.tokens import MemoryTokens
 from persist_cli.data.clips import interactions_of
 from persist_cli.errors import PersistError
 from persist_cli.rollout.arguments import check_starts, checked_actions
+from persist_cli.rollout.seeds import clip_seed
 from persist_cli.rollout.surroundings import Surroundings, Walk, plan_walks
-
-SEEDS: Final = 2**31  # of the sampling noise of an agent
 
 
 def unchanged(seen: Observations) -> Observations:
@@ -440,10 +439,3 @@ def cameras_along(camera: Cameras, info: TrajectoryInfo, actions: Sequence[str])
     world_up = torch.tensor(info.world_up, dtype=torch.float64)
     poses = info.vocabulary.follow(camera.world_from_camera[0], actions, world_up)
     return camera.at(poses)
-
-
-def clip_seed(seed: int, clip: int) -> int:
-    """Return the seed of a clip of a rollout, distinct for all seeds below 2^31 and a million clips."""
-    if not 0 <= seed < SEEDS or clip >= 1_000_000:
-        raise PersistError(f"seed {seed} must be 0 to {SEEDS - 1}, and a rollout has at most a million clips")
-    return seed * 1_000_000 + clip

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 
 from persist_cli.api.backbone import Clip, Clips
@@ -70,7 +71,7 @@ class OwnWrites:
             memory = memory_of(cached.sample, encoder.factory)
             if encoder.cache is not None and cached.sample.remembered is None:
                 encoder.cache.put_memory(cached.frames, memory.tensors())
-        return Chain(cached, memory, torch.Generator().manual_seed(cached.frames.seed))
+        return Chain(cached, memory, torch.Generator().manual_seed(errors_seed(cached.frames.seed)))
 
     def _predict(self, chains: Sequence[Chain], segment: int) -> None:
         """Predict the frames of one segment of all chains, and write them."""
@@ -102,3 +103,8 @@ class OwnWrites:
         clip = self._clip(replace(chain, memory=None), sample.clip)
         remembered = None if chain.memory is None else chain.memory.tensors()
         return replace(chain.cached, sample=replace(sample, clip=clip, before=(), context=None, remembered=remembered))
+
+
+def errors_seed(seed: int) -> int:
+    """Return the seed of the errors of a sample's written frames, another one than that of its clip's noise."""
+    return int(np.random.SeedSequence((seed, 1)).generate_state(1)[0])

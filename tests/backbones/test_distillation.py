@@ -16,6 +16,7 @@ from persist_backbones.extensions.distillation import (
     distance,
     predict_clean,
 )
+from persist_backbones.noise_levels import draw_levels
 from persist_cli.api.stages import Distill
 from persist_cli.errors import CheckpointError, RecipeError
 from tests.support.micro_model import FRAMEWISE, micro, random_clips, random_tokens, shaken, trained, with_adapter
@@ -157,6 +158,32 @@ def test_teacher_and_target_see_the_same_memory():
         target = consistency_target(clips, noised, states, distillation)
         assert torch.equal(target, predict_clean(backbone, clips, nearer, states))
         assert not torch.allclose(target, predict_clean(backbone, clips, nearer, states[::-1]))
+
+
+def test_the_teacher_steps_and_the_target_predicts_what_follows():
+    teacher, clips = shaken_micro(), random_clips(2)
+    target = copy.deepcopy(teacher)
+    shaken(target, 0.2)
+    noised = teacher.add_noise(clips, sample_generators(clips.seeds), lambda _: torch.full((2,), 999))
+    states = [generator.get_state() for generator in sample_generators(clips.seeds)]
+    following = torch.full((2,), 499)
+    levels = (noise_level(teacher.scheduler, timesteps) for timesteps in (noised.timesteps, following))
+    with torch.no_grad():
+        stepped = ddim_step(predict_clean(teacher, clips, noised, states), noised.noisy, *levels)
+        nearer = noised._replace(noisy=stepped, timesteps=following)
+        learned = consistency_target(clips, noised, states, Distillation(Distill(levels=2), teacher, target))
+        assert torch.equal(learned, predict_clean(target, clips, nearer, states))
+
+
+def test_student_teacher_and_target_are_told_the_noise_of_the_given_frame():
+    backbone, clips, told = micro(image_noise=0.5, **FRAMEWISE), random_clips(2), []
+    shaken(backbone)
+    distillation = distilled(backbone)
+    for model in (distillation.teacher, distillation.target, backbone):
+        model.transformer.image_level.register_forward_pre_hook(lambda _, inputs: told.append(inputs[0]))
+    consistency_loss(backbone, clips, distillation)
+    levels = draw_levels(sample_generators(clips.seeds), 0.5)
+    assert [torch.equal(level, levels) for level in told] == [True] * 3
 
 
 @pytest.mark.parametrize(

@@ -1,13 +1,14 @@
 """From a first frame to a clip: conditions, seeds, saving, and the losses of the stages."""
 
 import dataclasses
+import math
 
 import pytest
 import torch
 
 from persist_backbones.cogvideox.codec import decode_depth, encode_depth, fill_missing
 from persist_backbones.cogvideox.diffusion import loss_weights
-from persist_backbones.cogvideox.inputs import camera_latents
+from persist_backbones.cogvideox.inputs import camera_latents, interaction_rows
 from persist_cli.api.backbone import Backbone, Sampling
 from persist_cli.errors import CheckpointError, DataError, PersistError
 from tests.support.micro_model import micro, random_clips, shaken
@@ -106,10 +107,63 @@ def test_min_snr_lowers_the_weight_of_clean_samples_and_never_exceeds_one():
     assert float(loss_weights(scheduler, torch.tensor([999]), "min-snr-plus-one", 5.0)) == pytest.approx(1.0)
 
 
+def test_min_snr_plus_one_caps_the_weight_of_clean_samples_at_gamma():
+    scheduler, steps = micro(prediction="sample").scheduler, torch.tensor([0, 999])
+    assert loss_weights(scheduler, steps, "min-snr-plus-one", 5.0).tolist() == pytest.approx([5.0, 1.0])
+
+
+def test_an_interaction_has_an_embedding_for_each_step_of_a_clip():
+    clips = [("pick_up", None, "drop"), (None, "drop", "pick_up")]
+    assert interaction_rows(clips, ("pick_up", "drop"), 3).tolist() == [[1, 0, 6], [0, 4, 5]]
+
+
 def test_the_codec_stage_measures_the_scale_of_its_latents():
     backbone, clips = micro(), random_clips(2)
     backbone.finish_stage("codec", [clips])
     assert float(backbone.codec.encode(clips.rgb, clips.depth).detach().std()) == pytest.approx(1.0, abs=0.01)
+
+
+def test_the_scale_of_latents_is_the_mean_over_batches_and_measuring_it_again_changes_nothing():
+    backbone, bright = micro(), random_clips(2)
+    dark = dataclasses.replace(bright, rgb=bright.rgb // 4)
+    scales = [backbone.codec.measure_scale(clips.rgb, clips.depth) for clips in (bright, dark)]
+    assert scales[0] != pytest.approx(scales[1], rel=0.01)
+    for _ in range(2):
+        backbone.finish_stage("codec", [bright, dark])
+        assert backbone.codec.vae.config.scaling_factor == pytest.approx(sum(scales) / 2, rel=1e-4)
+
+
+def with_posterior(deviation, **settings):
+    """A micro model whose codec has latents of this standard deviation, whatever it codes."""
+    backbone = micro(**settings)
+    last = backbone.codec.vae.encoder.conv_out.conv
+    with torch.no_grad():
+        last.weight[backbone.codec.channels :] = 0.0
+        last.bias[backbone.codec.channels :] = 2 * math.log(deviation)
+    return backbone
+
+
+def test_the_psnr_of_the_codec_stage_is_that_of_the_colours():
+    backbone, clips = with_posterior(1e-6), random_clips(2)
+    decoded, _ = backbone.codec.decode_images(backbone.codec.encode(clips.rgb, clips.depth))
+    error = (decoded - (clips.rgb.movedim(-1, 1) / 127.5 - 1)) / 2
+    assert backbone(clips, "codec")["psnr"].item() == pytest.approx(
+        -10 * error.square().mean().log10().item(), abs=1e-2
+    )
+
+
+def test_the_codec_learns_from_latents_with_the_noise_of_their_posterior_and_from_its_prior(monkeypatch):
+    clips, decoded, losses = random_clips(2), [], []
+    for weight in (0.0, 0.5):
+        codec = with_posterior(0.3, kl_weight=weight)
+        images_of = codec.codec.images_of
+        monkeypatch.setattr(
+            codec.codec, "images_of", lambda latents, of=images_of: decoded.append(latents) or of(latents)
+        )
+        losses.append(codec(clips, "codec"))
+    mean = codec.codec.posterior(codec.codec.images(clips.rgb, clips.depth)).mean
+    assert (decoded[0] - mean).std().item() == pytest.approx(0.3, rel=0.05)
+    assert (losses[1]["loss"] - losses[0]["loss"]).item() == pytest.approx(0.5 * losses[0]["kl"].item(), rel=1e-3)
 
 
 def test_a_codec_that_trains_its_decoder_leaves_latents_and_their_scale_as_they_are():

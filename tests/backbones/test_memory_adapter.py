@@ -7,6 +7,7 @@ import torch
 
 from persist_backbones.adapters.cross import token_rays
 from persist_backbones.adapters.memory_block import position_code
+from persist_backbones.cogvideox.diffusion import sample_generators
 from persist_cli.api.actions import rotation_about
 from persist_cli.api.backbone import Sampling
 from persist_cli.api.cameras import Cameras
@@ -192,6 +193,21 @@ def test_a_code_of_rays_needs_the_rays():
 def test_positions_in_the_keys_need_positions():
     with pytest.raises(CheckpointError, match="key_positions needs positions"):
         with_adapter(micro(), positions="none", key_positions=True)
+
+
+@pytest.mark.parametrize(("dropout", "hides"), [(0.0, False), (1.0, True)])
+def test_training_hides_the_memory_where_the_dropout_says_so(dropout, hides):
+    backbone, clips = with_adapter(micro(), dropout=dropout), random_clips(2, random_tokens(2, 40))
+    shaken(backbone)
+    losses = [backbone(seen, "2")["loss"] for seen in (clips, dataclasses.replace(clips, tokens=None))]
+    assert torch.equal(*losses) == hides
+
+
+def test_training_hides_the_memory_from_a_share_of_the_samples_and_sampling_from_none():
+    backbone, clips = with_adapter(micro(), dropout=0.2), random_clips(60, random_tokens(60, 3))
+    trained, sampled = (backbone.memory_condition(clips, draws) for draws in (sample_generators(clips.seeds), None))
+    assert sampled.memory.mask.all()
+    assert 4 <= (~trained.memory.mask.any(dim=1)).sum() <= 22
 
 
 def test_absolute_positions_depend_on_the_origin_of_the_world():

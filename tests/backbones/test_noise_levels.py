@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from persist_backbones.cogvideox.diffusion import sample_generators
 from persist_backbones.noise_levels import add_level, draw_levels, fill_with_noise
 from persist_cli.api.backbone import Clips, Sampling
 from persist_cli.api.checkpoint import find_checkpoint
@@ -127,6 +128,45 @@ def test_training_with_noise_on_the_memory_reaches_the_embedding_of_its_level(fo
     parameters = backbone.trained_parameters("2")
     backbone(clips, "2")["loss"].backward()
     assert parameters["adapters.voxel.level.out.weight"].grad.any()
+
+
+def levels_told(module: torch.nn.Module) -> list[torch.Tensor]:
+    """The levels that an embedding is told from now on, call by call."""
+    told: list[torch.Tensor] = []
+    module.register_forward_pre_hook(lambda _, inputs: told.append(inputs[0]))
+    return told
+
+
+def test_in_training_a_model_is_told_the_level_of_the_noise_on_the_given_frame() -> None:
+    model, clips = micro(image_noise=0.5), random_clips(2)
+    told = levels_told(model.transformer.image_level)
+    model(clips, "1")
+    assert torch.equal(told[0], draw_levels(sample_generators(clips.seeds), 0.5))
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_in_training_an_adapter_is_told_the_level_of_the_noise_on_its_memory(
+    form: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, clips = with_adapter(micro(), form=form, noise=0.5), random_clips(2, random_tokens(2, 40))
+    adapter = model.adapters["voxel"]
+    told, noisy, added = levels_told(adapter.level), adapter.noisy, []
+
+    def recording(tokens: MemoryTokens, level: torch.Tensor, seeded: list[torch.Generator]) -> MemoryTokens:
+        added.append(level)
+        return noisy(tokens, level, seeded)
+
+    monkeypatch.setattr(adapter, "noisy", recording)
+    model(clips, "2")
+    assert torch.equal(told[0], added[0])
+    assert 0 < added[0].min() < added[0].max() < 0.5
+
+
+def test_noise_of_level_one_is_as_strong_as_the_features_of_a_memory() -> None:
+    adapter, tokens = with_adapter(micro(), noise=1.0).adapters["voxel"], random_tokens(2, 400)
+    tokens = dataclasses.replace(tokens, features=tokens.features * torch.tensor([0.1, 5.0])[:, None, None])
+    noise = adapter.noisy(tokens, torch.ones(2), generators()).features - tokens.features
+    assert noise.std(dim=(1, 2)).tolist() == pytest.approx(tokens.features.std(dim=(1, 2)).tolist(), rel=0.1)
 
 
 def test_the_given_frame_of_each_training_sample_is_noisy_and_the_target_is_not() -> None:

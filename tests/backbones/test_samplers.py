@@ -18,6 +18,7 @@ from persist_backbones.cogvideox.diffusion import (
     noise_like,
     sample_generators,
 )
+from persist_backbones.diffusers_models import CogVideoXDPMScheduler
 from persist_cli.api.inference import CONSISTENCY
 
 UNSHIFTED, SHIFTED = PRESETS["5b"]["scheduler"], PRESETS["2b"]["scheduler"]  # SNR shift scales of 1 and 3
@@ -109,6 +110,23 @@ def test_a_perfect_prediction_of_clean_latents_is_sampled_exactly(sampler, steps
     noise, generators = draw_noise([0, 1])
     config = UNSHIFTED | {"prediction_type": "sample"}
     assert torch.allclose(denoise(lambda *_: clean, noise, config, sampler, steps, generators), clean, atol=1e-6)
+
+
+@pytest.mark.parametrize("steps", [4, 50])
+def test_dpm_steps_with_the_prediction_before_like_the_pipeline_of_diffusers(steps):
+    scheduler = CogVideoXDPMScheduler(**UNSHIFTED)
+    scheduler.set_timesteps(steps)
+    predict = gaussian_denoiser(0.7, UNSHIFTED)
+    noise, generators = draw_noise([0, 1])
+    latents, clean, before = noise, None, None
+    for timestep in scheduler.timesteps:
+        predicted = predict(latents, timestep.expand(2))
+        latents, clean = scheduler.step(
+            predicted, clean, timestep, before, latents, generator=generators, return_dict=False
+        )
+        before = timestep
+    again, generators = draw_noise([0, 1])
+    assert torch.allclose(denoise(predict, again, UNSHIFTED, "dpm", steps, generators), latents, atol=1e-5)
 
 
 @CONFIGS

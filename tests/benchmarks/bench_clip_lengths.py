@@ -67,7 +67,8 @@ from persist_cli.io.files import write_json
 from persist_cli.metrics import METRICS
 from persist_cli.metrics.metric import Prediction
 from persist_cli.output.console import print_table, say, watched
-from persist_cli.rollout.world_model import WorldModel, clip_seed
+from persist_cli.rollout.seeds import clip_seed
+from persist_cli.rollout.world_model import WorldModel
 from tests.benchmarks.bench_sampling import find_model
 from tests.benchmarks.timing import say_conditions
 

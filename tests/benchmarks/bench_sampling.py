@@ -43,7 +43,8 @@ from persist_cli.metrics import METRICS
 from persist_cli.output.console import print_table, say, watched
 from persist_cli.plugins import make_backbone
 from persist_cli.recipe import make_recipe, read_recipe
-from persist_cli.rollout.world_model import WorldModel, clip_seed
+from persist_cli.rollout.seeds import clip_seed
+from persist_cli.rollout.world_model import WorldModel
 from tests.benchmarks.timing import Times, say_conditions
 from tests.support.room_views import write_room_walks
 

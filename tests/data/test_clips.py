@@ -9,6 +9,7 @@ import torch
 
 from persist_cli.api.geometry import near_poses
 from persist_cli.data.clips import ClipDataset, ClipPlan, DistributedBatches
+from persist_cli.data.writing_noise import WritingNoise
 from persist_cli.errors import DataError, RecipeError
 from tests.support.cell_walks import CHANGE, cells_around, write_with_cells
 from tests.support.micro_runs import SIZE
@@ -52,6 +53,19 @@ def test_interactions_of_skipped_frames_are_kept(walks):
     assert all(len(names) == 8 for names in interactions)
 
 
+@pytest.mark.parametrize("stride", [1, 2])
+def test_an_interaction_stands_at_the_step_in_which_it_was_done(walks, stride):
+    clips = ClipDataset([walks], plan(strides=(stride,)))
+    samples = [(clips.choose(number), clips[number].clip.interactions) for number in range(20)]
+    places = set()
+    for choice, interactions in samples:
+        done = choice.file.actions().index("pick_up") - choice.frames[0]
+        place = done // stride if 0 <= done < 8 * stride else None
+        assert interactions == tuple("pick_up" if step == place else None for step in range(8))
+        places.add(place)
+    assert len(places) > 2
+
+
 def test_a_negative_stride_plays_backwards_and_its_context_holds_the_frames_of_the_way_there(walks):
     clips = ClipDataset([walks], plan(strides=(-2,), context_frames=100))
     for number in range(10):
@@ -73,6 +87,24 @@ def test_a_context_without_targets_holds_no_frame_near_a_frame_to_predict_but_th
         assert not near[:-1].any()
 
 
+def test_what_is_near_a_frame_to_predict_is_what_the_plan_says(walks):
+    def contexts(**near):
+        clips = ClipDataset([walks], plan(context_frames=100, exclude_targets=1.0, **near))
+        return sum(len(clips.choose(number).context) for number in range(20))
+
+    assert contexts(exclude_metres=100.0, exclude_degrees=181.0) == 20  # the first frames of the clips alone
+    for name in ("exclude_metres", "exclude_degrees"):
+        assert contexts(**{name: 100.0}) < contexts()
+
+
+@pytest.mark.parametrize("stride", [2, -2])
+def test_clips_begin_and_end_at_every_frame_that_they_can(walks, stride):
+    clips = ClipDataset([walks], plan(strides=(stride,)))
+    choices = [clips.choose(number) for number in range(300)]
+    assert {min(choice.frames) for choice in choices} == set(range(24 - 16))
+    assert {max(choice.frames) for choice in choices} == set(range(16, 24))
+
+
 def test_most_clips_go_without_their_targets_and_the_others_keep_them(walks):
     clips = ClipDataset([walks], plan(strides=(-1,), context_frames=100, exclude_targets=0.9))
     choices = [clips.choose(number) for number in range(300)]
@@ -85,6 +117,18 @@ def test_fixed_clips_come_again_with_their_context_and_with_new_noise(walks):
     choices = [clips.choose(number) for number in range(60)]
     assert len({(str(choice.file.path), choice.frames, choice.context) for choice in choices}) == 2 * len(clips.files)
     assert len({choice.seed for choice in choices}) == 60
+
+
+def test_each_context_has_errors_of_its_own_which_come_again_with_it(walks):
+    clips = ClipDataset([walks], plan(clips_per_trajectory=3, context_frames=2, noise=WritingNoise(depth=0.05)))
+    errors: dict[object, list[float]] = {}
+    for number in range(60):
+        choice = clips.choose(number)
+        true = choice.file.read(choice.context).observations.depth[-1]
+        share = clips.read(choice, images=False).context.depth[-1] / true
+        errors.setdefault((choice.context, choice.noise_seed), []).append(share[SIZE // 2, SIZE // 2].item())
+    assert all(len(set(same)) == 1 for same in errors.values())
+    assert len({same[0] for same in errors.values()}) == len(errors) == 6
 
 
 def test_fixed_clips_do_not_depend_on_whether_there_is_a_context(walks):

@@ -7,7 +7,7 @@ import torch
 
 from persist_cli.evaluate.cases import Case
 from persist_cli.evaluate.columns import chosen_frames, make_columns, without_known_poses
-from persist_cli.evaluate.metric_suite import choose_metrics
+from persist_cli.evaluate.metric_suite import choose_metrics, far_returns, unseen_frames
 from persist_cli.evaluate.protocols import PROTOCOLS
 from persist_cli.metrics import METRICS
 
@@ -59,3 +59,12 @@ def test_choosing_scene_consistency_chooses_its_guard_too():
 def test_returns_within_one_predicted_clip_are_no_returns():
     cases = [case((0.0, 0.1, 0.89, 0.9), (-1, -1, 0, 0))]
     assert chosen_frames(cases, "return", predicted_at_once=2)[0].tolist() == [False, False, False, True]
+
+
+def test_a_return_over_just_as_many_frames_as_are_predicted_at_once_is_none():
+    assert far_returns(case((0.0,) * 4, (-1, -1, 0, 0)), 2) == [3]
+    assert far_returns(case((0.0,) * 4, (-1, -1, 0, 0)), 1) == [2, 3]
+
+
+def test_the_given_frame_and_one_half_seen_before_are_not_among_the_unseen():
+    assert unseen_frames(case((0.0, 0.5, 0.49, None))) == [False, False, True, False]

@@ -7,13 +7,14 @@ import pytest
 import torch
 
 from persist_cli.api.checkpoint import find_checkpoint
+from persist_cli.api.geometry import unproject
 from persist_cli.api.observations import Observations
 from persist_cli.checkpoints.load import load_backbone
 from persist_cli.data.store import Store
 from persist_cli.evaluate.cases import read_case
 from persist_cli.evaluate.new_poses import NewPoses
 from persist_cli.evaluate.protocols import PROTOCOLS, ClipSearch
-from persist_cli.evaluate.rows.controls import CodecReconstruction, Copy, Nearest, Warp
+from persist_cli.evaluate.rows.controls import CodecReconstruction, Copy, Nearest, Warp, pose_distances
 from persist_cli.evaluate.rows.warp import Surface, warp
 from tests.support.predictions import observe_room
 from tests.support.rooms import Room, look
@@ -107,3 +108,19 @@ def test_the_codec_gives_as_many_frames_as_the_clip_has(backbone, held_out):
 
 def test_walks_have_the_24_frames_that_these_tests_count_on(held_out):
     assert {len(file) for file in Store(held_out)} == {24}
+
+
+def test_a_pose_is_as_far_as_its_metres_and_radians_together():
+    cameras = room(look((0.0, 1.3, 0.0), 0.0), look((0.5, 1.3, 0.0), 0.0), look((0.0, 1.3, 0.0), 90.0)).cameras
+    assert pose_distances(cameras, cameras[0]).tolist() == pytest.approx([0.0, 0.5, np.pi / 2], abs=1e-6)
+
+
+def test_a_warp_shows_no_surface_through_a_nearer_one_nor_through_a_crack_between_its_points():
+    camera = room(look((0.0, 1.3, 0.0), 0.0)).cameras
+    near, far = (unproject(torch.full((1, 64, 64), depth), camera).reshape(-1, 3) for depth in (1.0, 2.0))
+    near = torch.cat([near[: 64 * 32 + 32], near[64 * 32 + 33 :]])  # without one pixel in the middle
+    frames = torch.tensor([0] * len(near) + [1] * len(far))
+    colors = torch.tensor([[200, 0, 0], [0, 200, 0]], dtype=torch.uint8)[frames]
+    rgb, depth = warp(Surface(torch.cat([near, far]), colors, frames), camera, torch.tensor([1.0, 0.0]).double())
+    assert (rgb == torch.tensor([200, 0, 0])).all()
+    assert depth.allclose(torch.ones(64, 64))

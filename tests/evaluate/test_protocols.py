@@ -13,7 +13,7 @@ from persist_cli.api.geometry import near_poses, pose_differences
 from persist_cli.data.reference import sample_data
 from persist_cli.data.store import Store, write_trajectory
 from persist_cli.errors import DataError
-from persist_cli.evaluate.cases import read_case
+from persist_cli.evaluate.cases import cases_json, counts, path_motion, read_case
 from persist_cli.evaluate.coverage import held_frames, recalled_share, seen_share
 from persist_cli.evaluate.new_poses import NEW_POSES, NewPoses, returning_frames
 from persist_cli.evaluate.protocols import PROTOCOLS, ClipSearch, turning_point
@@ -237,3 +237,30 @@ def test_a_capture_without_held_out_frames_or_with_few_has_no_later_clips(walks,
         PROTOCOLS["later"].find(search(walks))
     with pytest.raises(DataError, match="no capture has 20 frames held out"):
         PROTOCOLS["later"].find(search(capture, 20))
+
+
+def paths(*places):
+    """Poses at these metres to the right and degrees to the left."""
+    return torch.from_numpy(np.stack([look((x, 1.3, 0.0), yaw, 0.0) for x, yaw in places]))
+
+
+def test_the_first_visit_is_the_nearest_in_metres_and_radians():
+    poses = paths((0.0, 20.0), (0.6, 0.0), (0.0, 120.0), (0.0, 0.0))
+    assert returning_frames(poses, [range(frame) for frame in range(4)])[-1] == 0
+
+
+def test_disjoint_clips_are_chosen_by_what_they_recall_the_most_first(walks, monkeypatch):
+    shares = {5: 0.29, 10: 0.9, 12: 0.8, 15: 0.5}
+    monkeypatch.setattr("persist_cli.evaluate.protocols.recalled_share", lambda seen, start, last: shares.get(start, 0))
+    assert PROTOCOLS["revisit"].rank_starts(Store(walks)[0], 4, EVERY_POSE) == [10, 15]
+
+
+def test_the_motion_of_a_clip_is_that_of_its_own_path_and_only_predicted_frames_are_counted(held_out):
+    motion = path_motion(paths((0.0, 0.0), (0.3, 30.0), (0.0, 0.0)))
+    assert motion == pytest.approx({"path_metres": 0.6, "farthest_metres": 0.3, "turned_degrees": 60.0})
+    case = PROTOCOLS["revisit"].find(search(held_out))[0]
+    poses, own = case.file.poses(), slice(case.start, case.start + case.frames)
+    (values,) = cases_json([case])
+    assert {name: values[name] for name in motion} == pytest.approx(path_motion(poses[own]))
+    assert path_motion(poses[own]) != pytest.approx(path_motion(poses[: case.frames]))
+    assert counts([replace(case, counted=(True,) * case.frames)]) == (case.frames - 1, case.frames - 1)

@@ -200,3 +200,59 @@ def test_frames_are_binned_by_the_share_of_their_view_seen_before():
         {"low": 0.0, "high": 0.1, "mean": 1.0, "count": 1},
         {"low": 0.9, "high": 1.0, "mean": 2.5, "count": 2},
     ]
+
+
+def test_rows_of_other_models_draw_apart_and_trainings_apart_from_scenes():
+    one, again, other = (Draws.of(range(3), names) for names in (("a", "b", "c"), ("a", "b", "c"), ("d", "e", "f")))
+    assert np.array_equal(one.models, again.models)
+    assert not np.array_equal(one.models, other.models)
+    assert np.array_equal(one.clips, other.clips)
+    assert not np.array_equal(one.clips, one.models)  # although both are of three
+
+
+def test_the_interval_of_a_distance_counts_a_training_as_often_as_it_is_drawn():
+    values = np.array([0.0, 2.0, 7.0, 9.0])[:, None, None] + clips()
+    draws = Draws.of(range(50), ("a", "b", "c", "d"))  # of which three are drawn: one twice and another once
+    of_set = set_figure(lambda counts, model, seed: float(counts @ values[model, seed] / counts.sum()), draws, 3)
+    of_clips = mean_figure(values, draws).resampled
+    assert of_set.resampled - of_set.mean == pytest.approx(of_clips - of_clips.mean())
+
+
+def test_the_deviation_is_that_over_sampling_seeds_and_not_the_spread_of_trainings():
+    values = np.array([0.0, 5.0, 9.0])[:, None, None] + clips()
+    assert apart(values, "a", "b", "c").std == pytest.approx(clips()[0].mean(axis=1).std(ddof=1))
+
+
+def test_a_weighted_clip_that_one_row_lacks_counts_in_neither_mean_nor_resamples():
+    weights, values = np.array([900.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0])[None, None], clips(count=7, seeds=1)
+    lacking, draws = values * np.arange(1, 8), Draws.of(range(7))
+    lacking[..., 0] = np.nan
+    figure = mean_figure(lacking, draws, weights)
+    assert figure.mean == pytest.approx((lacking * weights)[..., 1:].sum() / weights[..., 1:].sum())
+    counts = draws.clips[:, 1:] * weights[0, 0, 1:]
+    assert figure.resampled == pytest.approx((counts * lacking[0, 0, 1:]).sum(1) / counts.sum(1))
+    gap = ((lacking - values) * weights)[..., 1:].sum() / weights[..., 1:].sum()
+    assert difference(figure, mean_figure(values, draws, weights))["mean"] == pytest.approx(gap)
+
+
+def test_clips_without_a_curve_are_not_among_those_of_its_interval():
+    values = clips(count=8, seeds=1)[..., None] + np.zeros(3)
+    values[:, :, :3] = np.nan
+    figure = curve_figure(values, np.ones_like(values), lambda curves: curves.min(axis=1), Draws.of(range(8)))
+    assert (figure.count, figure.units) == (5, 5)
+    assert figure.to_json()["low"] is None
+
+
+def test_a_difference_of_distances_has_no_interval_where_few_clips_are_in_both_sets():
+    draws = Draws.of(range(10), count=50)
+    some = np.where(np.arange(10) < LEAST_UNITS - 1, draws.clusters, -1)
+    whole, part = (set_figure(lambda counts, model, seed: float(counts[0]), draws, 1, known) for known in (None, some))
+    assert difference(whole, whole)["low"] is not None
+    assert difference(whole, part)["low"] is None
+
+
+def test_a_share_on_the_border_of_two_bins_is_counted_once_in_the_higher_one():
+    values, shares = np.array([[1.0, 2.0, 4.0]]), np.array([[0.1, 0.15, 0.5]])
+    assert [(one["low"], one["mean"], one["count"]) for one in seen_bins(values, shares, np.ones_like(values))] == [
+        (0.1, 1.5, 2), (0.5, 4.0, 1),
+    ]  # fmt: skip

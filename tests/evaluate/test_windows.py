@@ -10,7 +10,7 @@ import pytest
 from persist_cli.evaluate.columns import make_columns
 from persist_cli.evaluate.metric_suite import choose_metrics
 from persist_cli.evaluate.protocols import PROTOCOLS
-from persist_cli.evaluate.windows import CURVE_COLUMNS, ends_of, fall, tenths_of, window_values, windows_of
+from persist_cli.evaluate.windows import CURVE_COLUMNS, ends_of, fall, least, tenths_of, window_values, windows_of
 from persist_cli.metrics import METRICS
 
 
@@ -53,3 +53,13 @@ def test_only_protocols_that_write_have_figures_of_windows():
     names = [column.name for column in make_columns(chosen, PROTOCOLS["long"]) if column.frames == "windows"]
     assert names == ["psnr-fall", "sharpness-least", "lpips-alex-growth"]
     assert not [column for column in make_columns(chosen, PROTOCOLS["revisit"]) if column.frames == "windows"]
+
+
+def test_the_least_window_is_the_worst_of_those_that_have_a_value():
+    assert least(np.array([[0.9, 0.4, 1.2], [np.nan, 0.7, 0.8]])).tolist() == [0.4, 0.7]
+
+
+def test_frames_that_do_not_count_have_no_part_in_a_window_whatever_their_weight():
+    values, weights = np.array([[3.0, np.nan, 9.0]]), np.array([[1.0, 50.0, 2.0]])
+    means, totals = window_values(values, weights, [np.array([0, 1, 2])])
+    assert (means.tolist(), totals.tolist()) == ([[7.0]], [[3.0]])

@@ -19,8 +19,8 @@ from persist_cli.plugins import make_encoder
 from persist_memory.frames.context import ContextMemory
 from persist_memory.frames.frame_memory import FrameMemory, FrameSettings
 from persist_memory.frames.views import ViewsMemory, ViewsSettings, view_points
-from tests.support.room_views import room_walk
-from tests.support.rooms import UP, Room
+from tests.support.room_views import observe, room_walk
+from tests.support.rooms import UP, Room, look
 
 KINDS: dict[str, tuple[type[FrameMemory], FrameSettings]] = {
     "context": (ContextMemory, FrameSettings()),
@@ -177,3 +177,15 @@ def test_points_of_a_view_lie_in_it() -> None:
     assert points.shape == (2, 64, 3)
     local = torch.linalg.inv(cameras.world_from_camera[1]) @ torch.cat([points[1], torch.ones(64, 1)], 1).T
     assert (local[2] > 0.4).all()
+
+
+def test_an_album_of_views_drops_one_of_each_pair_and_not_both_of_one() -> None:
+    walk = room_walk(8)
+    images = written("views", walk[[0, 0, 4, 4]], capacity=2).tensors()["images"]
+    assert {image.numpy().tobytes() for image in images} == {walk.rgb[n].numpy().tobytes() for n in (0, 4)}
+
+
+def test_of_views_that_show_as_much_the_nearest_is_read() -> None:
+    behind_and_here = observe([look((0.0, 1.4, 1.0), 0.0, 0.0), look((0.0, 1.4, 0.0), 0.0, 0.0)])
+    chosen = written("views", behind_and_here, count=1).read(behind_and_here.cameras[1:], 1)
+    assert torch.equal(chosen.images[0], behind_and_here.rgb[1])

@@ -8,6 +8,7 @@ from persist_cli.api.memory import Memory
 from persist_cli.api.observations import Origin
 from persist_cli.api.scene_edits import Copy, Insert, Move, Paint, Remove
 from persist_cli.errors import DataError, PersistError
+from persist_memory.grid.occlusion import covered_by_blocks
 from tests.support.room_views import empty_memory, room_walk, written_memory
 
 BOX = {"low": (0.6, 0.0, 0.4), "high": (1.4, 0.4, 1.1)}  # of one piece of furniture
@@ -102,3 +103,30 @@ def test_after_all_was_removed_there_is_nothing_to_edit(room):
     with pytest.raises(DataError, match=r"^edit 2 .*the memory is empty"):
         room.edit([everything, Remove(**BOX)])
     assert len(room.points().positions)
+
+
+def test_moved_cells_are_edited_and_count_where_they_were_and_where_they_are(room):
+    removed = written_memory("voxel", room_walk(4), cell=FINE).edit([Remove(**BOX)]).changed
+    assert room.edit([Move(**BOX, by=(0.0, 20.0, 0.0))]).changed == 2 * removed
+    points = room.points()
+    edited = points.origins == CellOrigin.EDITED
+    assert int(edited.sum()) == removed
+    assert bool((points.positions[edited, 1] > 19).all())
+
+
+@pytest.mark.parametrize("pooling", ["max", "mean"])
+def test_tokens_of_painted_cells_have_the_features_of_the_colour_however_often_they_were_seen(pooling):
+    room = written_memory("voxel", room_walk(4), cell=FINE, pooling=pooling)
+    room.edit([Paint(**BOX, color=(1, 2, 3))])
+    tokens = room.read(room_walk(4).cameras, 4096)
+    painted = (tokens.colors == torch.tensor([1, 2, 3], dtype=torch.uint8)).all(1)
+    expected = room.encoder.encode(torch.tensor([1, 2, 3], dtype=torch.uint8).expand(1, 48, 64, 3))[0, 0, 0]
+    torch.testing.assert_close(tokens.features[painted], expected.expand(int(painted.sum()), -1))
+
+
+def test_nothing_is_imagined_along_rays_that_meet_an_edited_cell(room):
+    view = room_walk(4)[:1]
+    known = [covered_by_blocks(room.known_blocks(view.cameras), 0.25, view.cameras)]
+    room.edit([Paint(low=(-9.0, -9.0, -9.0), high=(9.0, 9.0, 9.0), color=(1, 2, 3))])
+    known.append(covered_by_blocks(room.known_blocks(view.cameras), 0.25, view.cameras))
+    assert torch.equal(*known)

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -5,7 +7,13 @@ from persist_cli.api.cameras import Cameras
 from persist_cli.api.geometry import unproject
 from persist_cli.api.observations import Origin
 from persist_memory.grid import occlusion
-from persist_memory.grid.occlusion import covered, covered_by_blocks, without_known
+from persist_memory.grid.occlusion import (
+    covered,
+    covered_by_blocks,
+    with_enough_new,
+    without_edges,
+    without_known,
+)
 from tests.support.room_views import observe, written_memory
 from tests.support.rooms import look
 
@@ -96,3 +104,20 @@ def test_imagined_places_are_written_and_recalled_where_nothing_was_observed():
     assert memory.figures().imagined == alone.figures().cells > 0
     camera = views.cameras[1:]
     assert torch.equal(memory.read(camera, 64).features, alone.read(camera, 64).features)
+
+
+def test_an_edge_is_a_jump_by_a_share_of_the_nearer_of_two_pixels():
+    view = observe([look((0.0, 1.4, 0.0), 0.0)])
+    depth = torch.ones_like(view.depth)
+    depth[:, :, 32:], depth[:, 24:, 32:] = 1.5, 1.5
+    for share, columns in ((0.6, []), (0.4, [31, 32])):
+        kept = without_edges(replace(view, depth=depth), share).depth
+        assert (kept == 0).all(1)[0].nonzero()[:, 0].tolist() == columns
+
+
+def test_a_frame_that_adds_just_the_least_share_is_written():
+    view = observe([look((0.0, 1.4, 0.0), 0.0)])
+    half = replace(view, depth=view.depth.clone())
+    half.depth[:, :24] = 0.0
+    assert torch.equal(with_enough_new(view, half, 0.5).depth, half.depth)
+    assert not bool(with_enough_new(view, half, 0.51).depth.any())

@@ -125,3 +125,23 @@ def test_imagined_points_change_no_observed_one_and_give_way_to_observations_nea
 def test_an_image_smaller_than_the_stride_gives_a_point_all_the_same():
     frame = room_walk(1)
     assert len(cloud(frame, stride=1000).tensors()["positions"]) == 1
+
+
+def test_two_frames_of_one_pose_that_look_different_have_points_of_both():
+    frame = room_walk(1)
+    both = cloud(frame, replace(frame, rgb=255 - frame.rgb))
+    assert len(both.tensors()["positions"]) == 2 * len(cloud(frame).tensors()["positions"])
+
+
+def test_a_pixel_as_far_as_the_greatest_depth_is_a_point():
+    frame = room_walk(1)
+    wall = replace(frame, depth=torch.full_like(frame.depth, 2.0))
+    assert len(cloud(wall, max_depth=2.0).tensors()["positions"]) == len(cloud(wall).tensors()["positions"])
+    assert not cloud(wall, max_depth=1.9).tensors()
+
+
+def test_no_imagined_point_stands_in_the_air_before_an_observed_one():
+    frame = room_walk(1)
+    memory, before = cloud(frame), cloud(frame)
+    memory.write(imagined(replace(frame, depth=0.5 * frame.depth)))
+    assert same_bits(memory, before)

@@ -6,13 +6,16 @@ import pytest
 import torch
 
 from persist_cli.api.cells import FREE, OUTSIDE, SOLID, CellOrigin
-from persist_cli.api.geometry import project
+from persist_cli.api.geometry import camera_rays, project
+from persist_cli.api.ground import ground_axes
 from persist_cli.api.memory import FrameOfReference
 from persist_cli.api.observations import Origin
+from persist_cli.api.scene_edits import Paint
 from persist_cli.errors import CheckpointError, DataError, PersistError
 from persist_cli.memorize.memory_file import load_memory
 from persist_cli.plugins import make_encoder, make_memory
 from persist_memory.scene import cell_store
+from persist_memory.scene.fusion import NEAR, Votes, votes_of
 from persist_memory.scene.grid_scene import GridScene
 from tests.support.cell_rooms import FORM, TABLE_CELLS, camera_at, cell_room
 from tests.support.room_views import observe, room_walk
@@ -317,3 +320,50 @@ def test_a_copy_is_independent():
     copy.write(room_walk(6))
     assert same(memory, scene(room_walk(2)))
     assert not same(memory, copy)
+
+
+def test_a_cell_that_as_many_frames_saw_as_saw_past_is_solid_and_free_after_one_more():
+    store = cell_store.CellStore(scene().cells)
+    cell, none = torch.tensor([[0, 0, 0]]), torch.zeros(0, 3, dtype=torch.long)
+    store.observe([Votes(cell, torch.tensor([[9, 9, 9, 1]]), none), Votes(none, torch.zeros(0, 4).long(), cell)])
+    assert store.known().classes.tolist() == [[[SOLID]]]
+    store.observe([Votes(none, torch.zeros(0, 4).long(), cell)])
+    assert store.known().classes.tolist() == [[[FREE]]]
+
+
+def test_only_cells_whose_middle_a_ray_comes_near_are_freed():
+    frame, axes = observe([look((0.0, 1.3, 0.0), 10.0, 0.0)], 8, 8), ground_axes(UP)
+    [votes] = votes_of(frame, axes, 0.25, 10.0)
+    pose = frame.cameras.world_from_camera[0]
+    local = (votes.passed.double() * 0.25 @ axes - pose[:3, 3]) @ pose[:3, :3]
+    local = local[local[:, 2] > 0.25]
+    away = (camera_rays(frame.cameras)[0].flatten(0, 1)[None] * local[:, None, 2:] - local[:, None]).norm(dim=-1)
+    assert len(local) > 20
+    assert float(away.amin(1).max()) <= 0.25 * NEAR + 1e-9
+
+
+def test_a_surface_farther_than_is_believed_is_no_cell_and_what_lies_before_it_is_free():
+    frame = observe([look((0.0, 1.3, 0.0), 0.0, 0.0)])
+    wall = replace(frame, depth=torch.full_like(frame.depth, 3.0))
+    near, far = scene(wall, farthest=2.0).cells, scene(wall, farthest=3.5).cells
+    assert not bool(near.solid.any())
+    assert int((near.known & ~near.solid).sum()) > 50
+    assert bool(far.solid.any())
+
+
+@pytest.mark.parametrize("value", [float("inf"), float("nan")])
+def test_depth_that_is_not_finite_says_as_little_as_missing_depth(value):
+    frame = room_walk(1)
+    missing, strange = (replace(frame, depth=frame.depth.clone()) for _ in range(2))
+    missing.depth[:, :8], strange.depth[:, :8] = 0.0, value
+    assert same(scene(strange), scene(missing))
+
+
+def test_an_edited_cell_is_read_as_a_fact_and_has_no_votes_of_the_frames_before():
+    memory = scene(room_walk(4))
+    memory.edit([Paint(low=(-9.0, -9.0, -9.0), high=(9.0, 9.0, 9.0), color=(1, 2, 3))])
+    tokens, tensors = memory.read(room_walk(4).cameras, 4096), memory.tensors()
+    assert set(tokens.origins.tolist()) == {Origin.OBSERVED}
+    edited = tensors["origins"] == CellOrigin.EDITED
+    assert int(edited.sum()) > 50
+    assert not any(bool(tensors[name][edited].any()) for name in ("hits", "passes", "sums"))

@@ -1,9 +1,11 @@
 import math
+from dataclasses import replace
 
 import torch
 
 from persist_cli.api.actions import rotation_about
 from persist_cli.api.geometry import unproject
+from persist_memory.snapshots.cover import nearest_distances, seen_patches
 from tests.support.room_views import empty_memory, moved, observe, room_walk, same_bits, translation, written_memory
 from tests.support.rooms import look
 
@@ -106,3 +108,39 @@ def test_image_sizes_that_are_no_multiple_of_the_grid_still_cover_the_image():
     tokens = written_memory("snapshots", observations).read(observations.cameras, 1000)
     assert len(tokens) == 64
     assert math.isclose(float(tokens.positions[:, 2].amin()), -2.0, abs_tol=0.6)
+
+
+def test_a_snapshot_of_few_patches_that_a_new_one_shows_leaves_a_full_album():
+    whole = observe([look((0.0, 1.4, 0.0), yaw) for yaw in (0.0, 335.0, 180.0)])
+    quarter = replace(whole[:1], depth=whole.depth[:1].clone())
+    quarter.depth[:, :, 16:] = 0.0
+    memory = written_memory("snapshots", quarter, capacity=3)
+    memory.write(whole[[1, 2]])
+    memory.write(whole[:1])
+    assert memory.figures().cells == 3
+    assert bool((memory.tensors()["depth"] > 0).all())
+
+
+def test_two_snapshots_show_the_same_surface_within_a_quarter_of_its_depth():
+    view = observe([look((0.0, 1.4, 0.0), 0.0)])
+
+    def store(metres):
+        return written_memory("snapshots", replace(view, depth=torch.full_like(view.depth, metres))).store
+
+    assert bool(seen_patches(store(4.8), store(4.0)).all())
+    assert not bool(seen_patches(store(5.2), store(4.0)).any())
+    assert not bool(seen_patches(store(0.5), store(0.7)).any())
+
+
+def test_a_snapshot_is_as_near_as_the_nearest_of_the_cameras():
+    places, centers = (
+        torch.tensor(rows, dtype=torch.float64)
+        for rows in ([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]], [[0.0, 0.0, 1.0], [3.0, 0.0, 0.0]])
+    )
+    assert nearest_distances(places, centers).tolist() == [1.0, 2.0]
+
+
+def test_a_second_snapshot_of_the_same_places_is_read_too_where_there_is_room():
+    observations = observe([look((0.001 * step, 1.4, 0.0), 0.0) for step in range(2)])
+    memory = written_memory("snapshots", observations, count=2)
+    assert len(memory.read(observations.cameras[:1], 1000)) == 128

@@ -9,6 +9,7 @@ from persist_cli.api.memory import FrameOfReference
 from persist_cli.api.observations import Observations
 from persist_cli.errors import CheckpointError, DataError
 from persist_cli.plugins import make_encoder, make_memory
+from persist_memory.grid import visibility
 from persist_memory.grid.pooling import CENTERED
 from tests.support.room_views import empty_memory, moved, observe, room_walk, same_bits, translation, written_memory
 from tests.support.rooms import UP, look
@@ -229,3 +230,29 @@ def test_reading_takes_cameras_of_another_size_than_those_that_wrote():
     cameras: Cameras = observations.cameras.resized(480, 640)
     memory = written_memory("voxel", observations)
     assert torch.equal(memory.read(cameras, 200).positions, memory.read(observations.cameras, 200).positions)
+
+
+def test_a_pixel_as_far_as_the_greatest_depth_is_pooled():
+    frame = room_walk(1)
+    wall = replace(frame, depth=torch.full_like(frame.depth, 2.0))
+    assert same_bits(written_memory("voxel", wall, max_depth=2.0), written_memory("voxel", wall))
+
+
+def test_a_strided_cell_has_the_colour_of_the_pixel_in_it():
+    frame = room_walk(1)
+    rows = torch.arange(48, dtype=torch.uint8)[:, None].expand(48, 64)
+    columns = torch.arange(64, dtype=torch.uint8).expand(48, 64)
+    told = replace(frame, rgb=torch.stack([rows, columns, torch.zeros_like(rows)], dim=-1)[None])
+    memory = written_memory("voxel", told, stride=4, cell=(0.02, 0.02, 0.02))
+    colors = memory.points().colors.long()
+    places = unproject(told.depth, told.cameras)[0, colors[:, 0], colors[:, 1]]
+    assert (colors[:, :2] % 4 == 0).all()
+    assert float((places - memory.points().positions).abs().max()) <= 0.01 + 1e-6
+
+
+@pytest.mark.parametrize("budget", [1, 7, 40])
+def test_a_read_of_few_cells_holds_the_nearest_of_all_blocks(budget, monkeypatch):
+    monkeypatch.setattr(visibility, "FIRST_CELLS", 1)
+    memory, cameras = written_memory("voxel", room_walk(8), cell=(0.05, 0.05, 0.05)), room_walk(8).cameras[:1]
+    whole = memory.read(cameras, 1_000_000)
+    assert torch.equal(memory.read(cameras, budget).positions, whole.positions[:budget])

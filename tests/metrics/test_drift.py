@@ -57,7 +57,7 @@ def test_a_moved_world_changes_no_drift():
     )
     depth = truth.depth * 1.1
     here, there = (DRIFT.measure(prediction(truth.rgb, depth, frames)) for frames in (truth, moved))
-    torch.testing.assert_close(here, there, atol=1e-3, rtol=0)
+    torch.testing.assert_close(here, there, atol=1e-6, rtol=0)
 
 
 def test_the_drift_of_a_shift_is_alike_for_small_and_large_images():

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from persist_cli.api.geometry import pixel_centers
 from persist_cli.io.hub import cached_weight
 from persist_cli.metrics import METRICS
 from persist_cli.metrics.metric import Prediction
-from persist_cli.metrics.return_views import match_views
+from persist_cli.metrics.return_views import Match, match_views
 from tests.support.predictions import observe_room, setup, there_and_back
 from tests.support.rooms import look
 
@@ -80,3 +81,18 @@ def test_lpips_to_the_own_first_visit_is_0_for_the_same_picture_and_more_for_ano
     figures = LPIPS.measure(replace(clip, rgb=changed))
     assert figures[4] == pytest.approx(0, abs=1e-6)
     assert figures[5] > 0.1
+
+
+def test_a_wide_view_is_sampled_along_its_own_width_and_height():
+    image = torch.rand(3, 6, 10, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    match = Match(pixel_centers(6, 10), torch.ones(6, 10, dtype=torch.bool))
+    assert torch.allclose(match.sample(image), image)
+
+
+def test_pixels_that_the_first_visit_did_not_see_have_no_part_in_the_error():
+    clip = turned_by(20.0)
+    known = match_views(clip.truth, 2, 0).known
+    changed = clip.rgb.clone()
+    changed[2][~known] = 255 - changed[2][~known]
+    assert 0 < known.double().mean() < 1
+    assert PSNR.measure(replace(clip, rgb=changed))[2] == PSNR.measure(clip)[2]

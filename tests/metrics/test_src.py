@@ -2,14 +2,18 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
+from persist_cli.api.geometry import pixel_centers
 from persist_cli.io.files import write_json
 from persist_cli.io.hub import cached_weight
 from persist_cli.metrics import METRICS
-from persist_cli.metrics.src import ENCODERS, farthest
-from tests.support.predictions import setup, there_and_back
+from persist_cli.metrics.return_views import Match
+from persist_cli.metrics.src import ENCODERS, farthest, patch_similarity
+from tests.support.predictions import observe_room, setup, there_and_back
+from tests.support.rooms import look
 
 SRC, PATCH, AWAY = METRICS["src"], METRICS["src-patch"], METRICS["src-away"]
 needs_encoder = pytest.mark.skipif(
@@ -103,3 +107,21 @@ def test_the_definition_names_the_weights_that_are_used(tmp_path, monkeypatch):
 
 def test_the_guard_compares_with_the_farthest_camera():
     assert farthest(there_and_back().truth.cameras, 0, 6) == 3
+
+
+def test_a_metre_is_as_far_as_a_radian():
+    poses = np.stack([look((x, 1.3, 0.2), yaw, 0.0) for x, yaw in ((0.0, 0.0), (1.0, 0.0), (0.0, 50.0))])
+    assert farthest(observe_room(poses).cameras, 0, 2) == 1
+
+
+def test_each_patch_is_compared_with_the_one_at_its_place_if_the_first_visit_sees_its_centre():
+    earlier = torch.eye(6).double().reshape(2, 3, 6)  # patches of 20 pixels across and 10 down, each unlike the others
+    places = pixel_centers(20, 60) + torch.tensor([20.0, 0.0])  # the view is one patch to the left
+    seen = (places[..., 0] < 60) & (places[..., 0] % 20 > 5)
+    patches = earlier.roll(-1, dims=1)
+    assert patch_similarity(patches, earlier, Match(places, seen)) == pytest.approx(100)
+    assert patch_similarity(patches, earlier, Match(places, torch.ones_like(seen))) == pytest.approx(200 / 3)
+
+
+def test_the_guard_compares_the_first_visit_and_not_the_return_with_what_lies_between():
+    assert AWAY.pairs(there_and_back()) == {4: (2, 3), 5: (1, 3), 6: (0, 3)}

@@ -11,7 +11,7 @@ from persist_cli.api.policy import Goal, Situation
 from persist_cli.errors import DataError, PersistError, RecipeError
 from persist_cli.io.settings import parse_settings
 from persist_cli.planning.futures import WorldFutures
-from persist_cli.planning.judge import Budget, Judge, check_goal
+from persist_cli.planning.judge import LAST, Budget, Judge, check_goal
 from persist_cli.planning.planners import Cem, CemSettings, Rank, RankSettings, draw, frequencies
 from persist_cli.plugins import make_cost, make_policy
 from tests.support.pixel_cost import PixelCost
@@ -97,6 +97,12 @@ def test_what_ends_where_the_agent_has_looked_comes_last(judge, model, situation
     assert turned.cost == pytest.approx(0.0, abs=1e-6)  # another view from the same place
 
 
+def test_a_view_a_step_or_a_turn_beside_one_that_was_looked_at_comes_last_too(judge, model):
+    looked = model.agents[0].cameras_after(AHEAD).world_from_camera[-1:].double()
+    beside = judge(looked=looked).judge([AHEAD[:3], (*AHEAD, "left")], 1)
+    assert all(candidate.cost >= LAST for candidate in beside)
+
+
 def test_frames_that_nobody_imagined_are_not_counted_but_use_up_a_budget(judge, situation):
     one = judge(budget=Budget(8))
     plan = Rank(make_policy("random", {}), RankSettings(4, 5)).plan(situation, one, seeded())
@@ -144,6 +150,16 @@ def test_later_rounds_draw_what_the_elites_did(judge, situation):
     ]
     assert means[1] < means[0]
     assert plan.judged < 5 * 60 * 4  # as the distributions narrow, sequences come again
+
+
+def test_the_next_round_judges_a_share_of_the_elites_again_beside_its_own(judge, situation, monkeypatch):
+    one, rounds = judge(), []
+    own = one.judge
+    monkeypatch.setattr(one, "judge", lambda names, number: rounds.append(list(names)) or own(names, number))
+    Cem(CemSettings(horizon=4, candidates=20, rounds=2, elites=0.5, kept=0.4)).plan(situation, one, seeded())
+    elites = sorted(rounds[0], key=lambda names: one.judged[names].cost)[:10]
+    assert rounds[1][:4] == list(dict.fromkeys(elites))[:4]
+    assert [len(candidates) for candidates in rounds] == [20, 20]
 
 
 def test_a_policy_proposes_half_of_the_first_round(judge, situation):

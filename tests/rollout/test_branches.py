@@ -6,6 +6,7 @@ import torch
 
 from persist_cli.data.clips import interactions_of
 from persist_cli.errors import PersistError
+from persist_cli.rollout.seeds import clip_seed
 from persist_memory.grid.visibility import Views
 from tests.support.micro_worlds import remembering_model, world_on_walk
 
@@ -104,6 +105,13 @@ def test_branches_write_into_memories_of_their_own(start):
     assert all(torch.equal(branches.agents[0].memory.tensors()[name], value) for name, value in first.items())
 
 
+def test_branches_write_with_the_errors_of_the_first_agent(start):
+    written = []
+    branches = start(disturb=lambda seen: written.append(len(seen)) or seen).branches(2)
+    branches.step([["left"] * 8] * 2)
+    assert written == [1, 8, 8]  # the first frame, and a clip of each branch
+
+
 def test_branches_that_do_not_write_share_one_memory(start):
     branches = start(write=False).branches(2)
     branches.step(ACTIONS[:2])
@@ -125,6 +133,24 @@ def test_branching_again_does_not_change_the_first_world_model(start):
     expected = start().step([["left"] * 16])[0].seen
     assert alike(continued, expected[8:])
     assert alike(model.step([["left"] * 8])[0].seen, expected[:8])
+
+
+def test_each_clip_of_a_rollout_has_noise_of_its_own_and_branches_have_the_same(start, backbone, monkeypatch):
+    seeds, generate = [], backbone.generate
+
+    def recording(first, sampling):
+        seeds.append(list(first.seeds))
+        return generate(first, sampling)
+
+    monkeypatch.setattr(backbone, "generate", recording)
+    branches = start(seed=5).branches(2)
+    branches.step([["left"] * 16] * 2)
+    assert seeds == [[clip_seed(5, 0)] * 2, [clip_seed(5, 1)] * 2]
+
+
+def test_each_seed_and_clip_has_noise_of_its_own_beyond_32_bits_too():
+    seeds = [clip_seed(seed, clip) for seed in (0, 1, 4295, 2**26, 2**31 - 1) for clip in (0, 1, 32704)]
+    assert len({torch.rand(4, generator=torch.Generator().manual_seed(seed)).sum().item() for seed in seeds}) == 15
 
 
 def test_branches_that_cannot_work_are_refused(start):

@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 import math
 import shutil
+from dataclasses import replace
 
 import av
 import pytest
 import torch
 
-from persist_cli.rollout.outputs import means, summary
+from persist_cli.data.store import Store
+from persist_cli.rollout.camera_path import CameraPath, Rollout
+from persist_cli.rollout.outputs import means, new_frames, summary
 
 
 @pytest.fixture
@@ -66,6 +69,16 @@ def test_frames_near_a_remembered_one_are_in_the_lists_but_not_in_the_means(roll
     assert not any(stored["new_poses"]["counted"])
     assert "psnr" not in stored["mean_against_ground_truth"]
     assert "(0 of 6 count: those farther than 0.2 m and 10° from every remembered frame): none" in result.out
+
+
+def test_a_frame_near_the_first_one_is_not_new_with_and_without_a_memory(walks):
+    walk = Store(walks)[0].read()
+    seen, start = walk.observations, walk.observations[:1]
+    path = CameraPath(start, seen[:3].cameras, (None,) * 3, ("stay",) * 3, None, walk.info)
+    rollout = Rollout(path, seen[[0, 11, 8]], None, None, 0.0, gives_depth=True)
+    assert new_frames(rollout) == [False, True, True]
+    remembered = seen[8:9].cameras.world_from_camera.double()
+    assert new_frames(replace(rollout, remembered=remembered)) == [False, True, False]
 
 
 def test_frames_that_are_not_there_to_follow_are_said_in_one_line(roll):

@@ -14,8 +14,10 @@ from accelerate import Accelerator
 
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.clips import ClipLatents
+from persist_cli.api.encoder import Encoder
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.checkpoints.load import adapter_memory, load_backbone
+from persist_cli.data.augment import View
 from persist_cli.data.clips import ClipDataset, ClipPlan
 from persist_cli.errors import PersistError
 from persist_cli.io.files import ASIDE, read_tensors
@@ -161,19 +163,19 @@ def test_a_resumed_run_with_a_cache_equals_an_uninterrupted_one_without(persist,
 
 @pytest.fixture
 def keys_of(walks, voxel):
-    """Makes the keys of one clip for a stage, a number of tokens, a changed codec, and changes to the memory."""
+    """Makes the keys of one clip for a stage, settings of adapter and data, a changed codec, and another memory."""
     checkpoint = find_checkpoint(voxel)
     backbone, usual = load_backbone(checkpoint), adapter_memory(checkpoint, "voxel")
     frames = ClipDataset(
         [walks], ClipPlan(frames=9, strides=(1,), context_frames=5, seed=3, image_size=(SIZE, SIZE))
     ).choose(0)
 
-    def of(stage="2", budget=7, codec=0.0, precision="no", **changes):
+    def of(stage="2", budget=7, codec=0.0, precision="no", adapter=None, data=None, **changes):
         memory = replace(usual, **changes) if stage == "2" else None
-        backbone.add_adapter(f"adapter-{len(backbone.adapters)}", 6, {"token_budget": budget})
+        backbone.add_adapter(f"adapter-{len(backbone.adapters)}", 6, {"token_budget": budget} | (adapter or {}))
         factory = MemoryFactory.of(memory) if memory else None
-        data = DataSettings(clips_per_trajectory=3)
-        recipe = Recipe(stage, memory=memory, data=data, training=TrainingSettings(precision=precision))
+        settings = DataSettings(clips_per_trajectory=3, **(data or {}))
+        recipe = Recipe(stage, memory=memory, data=settings, training=TrainingSettings(precision=precision))
         with torch.no_grad():
             next(backbone.codec.parameters()).add_(codec)
         return CacheKeys.of(recipe, backbone, factory, "cpu", recipe.training.precision).of_clip(frames)
@@ -193,6 +195,34 @@ def test_another_codec_or_precision_changes_the_key_of_latents_and_not_of_tokens
     clip_keys = [keys_of(), keys_of(codec=1.0), keys_of(precision="bf16")]
     assert len({clip.latents for clip in clip_keys}) == len(clip_keys)
     assert {clip.tokens for clip in clip_keys} == {clip_keys[0].tokens}
+
+
+def test_other_weights_or_settings_of_an_encoder_change_the_key_of_tokens_and_not_of_latents(keys_of, monkeypatch):
+    clip_keys = [keys_of(), *(keys_of(encoder="classes", encoder_settings={"classes": count}) for count in (5, 6))]
+    encoded = Encoder.encoded
+    monkeypatch.setattr(Encoder, "encoded", lambda self, rgb: encoded(self, rgb) + 1)
+    clip_keys.append(keys_of())
+    assert len({clip.tokens for clip in clip_keys}) == len(clip_keys)
+    assert len({clip.latents for clip in clip_keys}) == 1
+
+
+@pytest.mark.parametrize("errors", ["pose_drift", "pose_drift_degrees", "depth_noise"])
+def test_other_errors_of_what_is_written_change_the_key_of_tokens_and_not_of_latents(keys_of, errors):
+    clip_keys = [keys_of(), *(keys_of(data={errors: strength}) for strength in (0.1, 0.2))]
+    assert len({clip.tokens for clip in clip_keys}) == len({clip.memory for clip in clip_keys}) == 3
+    assert len({clip.latents for clip in clip_keys}) == 1
+
+
+def test_tokens_that_are_kept_as_rendered_views_depend_on_the_rendering_the_codec_and_the_precision(keys_of):
+    rendered = {"form": "rendered"}
+    clip_keys = [
+        keys_of(),
+        keys_of(adapter=rendered),
+        keys_of(adapter=rendered | {"token_size": 0.05}),
+        keys_of(adapter=rendered, precision="bf16"),
+        keys_of(adapter=rendered, codec=1.0),
+    ]
+    assert len({clip.tokens for clip in clip_keys}) == len(clip_keys)
 
 
 @pytest.mark.parametrize("newer", ["memory", "encoder"])
@@ -268,6 +298,23 @@ def test_clips_of_other_frames_contexts_or_trajectories_have_other_keys(walks, t
     assert long_context.latents == short_context.latents
     assert long_context.tokens != short_context.tokens
     assert cache_key({"a": 1}) != cache_key({"a": 2})
+
+
+def test_another_context_or_other_errors_of_it_are_another_memory_of_the_same_clip(walks, tmp_path):
+    clips = clips_in(walks, tmp_path)
+    clip = clips.clips.choose(0)
+    others = [clip, *(replace(clip, noise_seed=seed) for seed in (1, 2)), replace(clip, context=clip.context[1:])]
+    keys = [clips.cache.keys.of_clip(other) for other in others]
+    assert len({key.tokens for key in keys}) == len({key.memory for key in keys}) == len(others)
+    assert len({key.latents for key in keys}) == 1
+
+
+def test_each_view_of_a_clip_has_keys_of_its_own(walks, tmp_path):
+    clips = clips_in(walks, tmp_path)
+    views = [None, View(None, True, (1.0, 1.0, 1.0)), View(None, False, (1.0, 1.0, 1.1))]
+    keys = [clips.cache.keys.of_clip(replace(clips.clips.choose(0), view=view)) for view in views]
+    for part in ("latents", "tokens", "memory"):
+        assert len({getattr(key, part) for key in keys}) == len(views)
 
 
 def test_the_true_cells_of_another_frame_are_another_memory_of_the_same_clip(walks, tmp_path):

@@ -28,6 +28,16 @@ def descend(optimizer, parameters, rate):
 
 
 @pytest.mark.parametrize("name", ["adamw", "muon"])
+def test_the_weights_of_a_model_decay_as_its_recipe_says_and_those_of_its_opponent_do_not(name):
+    settings = TrainingSettings(optimizer=name, weight_decay=0.3)
+    alone = make_optimizer(network(1), settings)
+    assert {group["weight_decay"] for group in alone.param_groups} == {0.3}
+    opponent = network(2)
+    against = make_optimizer([*network(1), *opponent], settings, Opponent(opponent, OTHER))
+    assert [group["weight_decay"] for group in against.param_groups] == [0.3] * len(alone.param_groups) + [0.0]
+
+
+@pytest.mark.parametrize("name", ["adamw", "muon"])
 def test_either_is_trained_as_it_would_be_alone(name):
     settings = TrainingSettings(optimizer=name, learning_rate=RATE, weight_decay=0.1)
     model, opponent = network(1), network(2)

@@ -42,6 +42,12 @@ def test_the_segments_of_a_chained_sample_follow_each_other_and_its_context_come
         assert choice.context[-1] == choice.before[0][0]
 
 
+def test_segments_of_a_sample_are_predicted_from_other_noise_than_its_clip(walks):
+    for choice in map(chained_clips(walks, segments=2).choose, range(20)):
+        before, clip = choice.segments()
+        assert clip.seed == choice.seed != before.seed
+
+
 def test_a_share_of_the_samples_is_chained_after_the_warm_up(walks):
     clips = chained_clips(walks, own_writes=0.5, own_after=100)
     chained = [bool(clips.choose(number).before) for number in range(300)]
@@ -76,6 +82,37 @@ def test_a_clip_begins_with_the_frame_that_the_model_predicted_and_remembers_wha
     origins = own.sample.remembered["origins"].tolist()
     assert {Origin.IMAGINED, Origin.OBSERVED} == set(origins)
     assert encoder.with_tokens(own).tokens.origins.min() == Origin.IMAGINED
+
+
+class Written(list):
+    """Errors of what is written, which leave it as it is and keep it."""
+
+    def disturb(self, seen, draws):
+        self.append((seen, torch.rand(1, generator=draws)))
+        return seen
+
+
+def numbered(clips: Clips) -> tuple[torch.Tensor, torch.Tensor]:
+    """Predictions whose colours and metres are the numbers of their frames."""
+    numbers = torch.arange(9).view(1, 9, 1, 1).expand(len(clips.seeds), 9, SIZE, SIZE)
+    return numbers[..., None].expand(-1, -1, -1, -1, 3).to(torch.uint8), numbers.float()
+
+
+def test_predicted_frames_are_written_where_the_cameras_of_their_segment_saw_them(walks, encoder, monkeypatch):
+    clips, written = CachedClips(chained_clips(walks), None), Written()
+    samples = [encoder.with_latents(clips[number]) for number in (0, 1)]
+    monkeypatch.setattr(encoder.backbone, "predict_once", numbered)
+    owns = OwnWrites(encoder, written).written(samples)
+    for cached, own, (seen, draw) in zip(samples, owns, written, strict=True):
+        noise = torch.Generator().manual_seed(cached.sample.clip.seed)
+        assert not torch.equal(draw, torch.rand(1, generator=noise))  # errors are no numbers of the clip's noise
+        cameras = cached.sample.before[0].observations.cameras
+        assert torch.equal(seen.cameras.world_from_camera, cameras.world_from_camera[1:])
+        assert seen.rgb[:, 0, 0, 0].tolist() == seen.depth[:, 0, 0].tolist() == list(range(1, 9))
+        assert set(seen.origins.tolist()) == {Origin.IMAGINED}
+        last = replace(cached.sample.clip, observations=seen[-1:], latents=None)
+        assert torch.equal(own.sample.clip.latents.image, encoder.encode(last).image)
+    assert written[0][1] != written[1][1]  # each sample has errors of its own
 
 
 def test_other_samples_of_a_batch_are_left_alone(walks, encoder):

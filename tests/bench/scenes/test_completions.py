@@ -12,6 +12,7 @@ from torch import Tensor
 from persist_cli.api.cells import FREE
 from persist_cli.api.scene_model import SceneForm
 from persist_cli.bench.scenes.class_counts import class_counts, class_iou, iou_figure, mean_iou, share_figure, things
+from persist_cli.bench.scenes.completion_part import row_counts
 from persist_cli.bench.scenes.completions import (
     CodedTruth,
     Empty,
@@ -195,3 +196,14 @@ def test_cells_of_other_classes_or_sizes_are_refused():
         same_form(type(grid).unknown((0, 0, 0), (1, 1, 1), other, grid.axes), FORM, "x")
     with pytest.raises(DataError, match=r"cells of 0.5 m, the data's are 0.25 m"):
         same_form(type(grid).unknown((0, 0, 0), (1, 1, 1), type(FORM)(0.5), grid.axes), FORM, "x")
+
+
+def test_what_a_row_leaves_unknown_counts_as_free_whatever_class_stands_there():
+    grid = two_rooms()
+    view = view_of(grid, known_room(grid))
+    classes = view.truth.classes[None]
+    samples = {"classes": classes, "known": torch.zeros_like(classes, dtype=torch.bool)}
+    journal = SimpleNamespace(samples=lambda row, name: samples)
+    bench = SimpleNamespace(views=[view], palette=FORM.palette, plan=SimpleNamespace(seeds=1), journal=journal)
+    counts = row_counts(bench, SimpleNamespace(name="row"))
+    assert np.array_equal(counts[0, 0], counts_of(Empty().complete(view, 0, 0), view))

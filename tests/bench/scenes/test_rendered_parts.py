@@ -20,6 +20,7 @@ from persist_cli.bench.scenes.journal import SceneJournal
 from persist_cli.bench.scenes.rendering import RendererLoader, rendered_rows
 from persist_cli.bench.scenes.return_part import (
     WINDOW,
+    compared_frames,
     first_visit,
     frame_values,
     obstacles,
@@ -202,3 +203,21 @@ def test_houses_seen_in_few_frames_have_no_true_pieces(tmp_path: Path) -> None:
 def test_psnr_is_that_of_the_mean_squared_error() -> None:
     black, grey = torch.zeros(1, 4, 4, 3, dtype=torch.uint8), torch.full((1, 4, 4, 3), 51, dtype=torch.uint8)
     assert float(psnr(black, grey)) == pytest.approx(20 * math.log10(255 / 51))
+
+
+def test_a_walk_is_as_long_as_its_way_out_and_only_frames_of_other_clips_are_compared() -> None:
+    rgb = torch.randint(0, 255, (9, 16, 16, 3), dtype=torch.uint8)
+    poses = torch.eye(4).repeat(9, 1, 1)
+    poses[:, 0, 3] = torch.tensor([0.0, 0.5, 1.0, 1.5, 2.0, 1.5, 1.0, 0.5, 0.0])
+    walk = {"rgb": rgb, "poses": poses, "out": torch.tensor(5), "seconds": torch.tensor(2.0)}
+    assert compared_frames(walk, 4) == ([7, 8], [1, 0])
+    seen = frame_values(walk, 4, 1.0)
+    assert np.isfinite(seen["sharpness"]).tolist() == [False] + [True] * 8  # the first frame is given
+    assert walk_values(walk, seen, 4)["metres"] == 2.0
+
+
+def test_pieces_of_a_walk_begin_after_the_given_frame() -> None:
+    rgb = torch.arange(2 * LEAST_FRAMES + 1, dtype=torch.uint8)[:, None, None, None].expand(-1, 2, 2, 3)
+    firsts = [int(piece[0, 0, 0, 0]) for piece in pieces(rgb)]
+    assert (firsts, {len(piece) for piece in pieces(rgb)}) == ([1, LEAST_FRAMES + 1], {LEAST_FRAMES})
+    assert len(pieces(rgb[:-1])) == 1

@@ -5,18 +5,20 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 from persist_cli.api.actions import walking_actions
 from persist_cli.bench.scenes.journal import file_name
 from persist_cli.bench.scenes.plan_pictures import class_colors
 from persist_cli.bench.scenes.run_scene_bench import against_baselines
-from persist_cli.bench.scenes.walk_part import Wanderer
+from persist_cli.bench.scenes.walk_part import Wanderer, house_shares, new_cells, window_values
 from persist_cli.checkpoints.scene_models import find_scene_model
 from tests.conftest import Persist
-from tests.support.cell_houses import write_cell_houses
+from tests.support.cell_houses import FORM, two_rooms, write_cell_houses
 from tests.support.micro_runs import run_persist
 
 SMALL = ("--radius", 2, "--seeds", 2, "--set", "memory.steps=1")
@@ -179,3 +181,23 @@ def test_an_agent_that_is_stopped_turns_before_it_goes_on() -> None:
     rest = [wanderer.next(False) for _ in range(12)]
     assert rest[-1] == "forward"
     assert set(rest[: rest.index("forward")]) <= {turn}
+
+
+def test_the_figures_of_a_window_are_of_its_new_cells_and_of_the_steps_ahead() -> None:
+    window = {"new": [6, 0, 2, 0, 2], "agreement": [[0, 0, 0]] * 6, "tried": 4, "refused": 1}
+    figures = window_values(window | {"steps": 10, "metres": 0.75, "seconds": 5.0}, np.array([0.5, 0.0, 0.3, 0.0, 0.2]))
+    assert figures == pytest.approx(
+        {"new": 10, "occupied": 0.2, "free": 0.6, "drift": 0.1, "miou": float("nan"), "blocked": 0.25, "metres": 0.75,
+         "seconds": 0.5}, nan_ok=True,
+    )  # fmt: skip
+
+
+def test_new_cells_agree_or_not_only_where_the_true_house_knows_them() -> None:
+    house, before, after = two_rooms(), two_rooms(), two_rooms()
+    house.origins[20:], before.origins[10:] = 0, 0
+    found = new_cells(before, after, SimpleNamespace(house=house))
+    assert sum(found["new"]) == int(after.known[10:].sum())
+    assert np.array(found["agreement"])[:-1].sum(0).tolist() == [int(house.known[10:20].sum())] * 3
+    shares = house_shares([SimpleNamespace(house=house)], len(FORM.palette))
+    counts = torch.bincount(house.classes[:20].flatten().long(), minlength=len(FORM.palette)).numpy()
+    assert shares == pytest.approx(counts / counts.sum())

@@ -5,12 +5,14 @@ from __future__ import annotations
 import copy
 import json
 
+import numpy as np
 import pytest
 
 from persist_cli.errors import DataError
-from persist_cli.evaluate.report.compare import compare_runs, run_compare
+from persist_cli.evaluate.report.compare import compare_cells, compare_runs, run_compare
 from persist_cli.evaluate.report.page import write_report
 from persist_cli.evaluate.report.pictures import Pictures
+from persist_cli.evaluate.report.result_file import Cell
 from tests.support.example_results import ROWS, example_results
 
 
@@ -290,3 +292,22 @@ def test_run_compare_prints_a_table_and_leaves_json_and_markdown(tmp_path, capsy
     assert "+1.00" in (tmp_path / "out/compare.md").read_text()
     run_compare(tmp_path / "report", tmp_path / "b.json", True, None)
     assert json.loads(capsys.readouterr().out) == comparison
+
+
+def test_clips_of_one_scene_are_drawn_together_in_a_difference():
+    gaps = np.repeat([0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0], 4)
+    a, b = (Cell(mean=float(values.mean()), per_clip=values.tolist()) for values in (0 * gaps, gaps))
+    scenes, clips = (compare_cells(a, b, clusters) for clusters in (np.arange(32) // 4, np.arange(32)))
+    assert (scenes.difference, scenes.pairs, clips.pairs) == (3.5, 8, 32)
+    assert scenes.high - scenes.low > 1.5 * (clips.high - clips.low)
+
+
+@pytest.mark.parametrize(("drawn", "unit"), [(("clips", "clips"), "clips"), (("clips", "scenes"), "scenes")])
+def test_clips_are_drawn_only_where_both_runs_drew_them(tmp_path, drawn, unit):
+    runs = [
+        write_results(
+            tmp_path, f"{number}.json", lambda results, one=one: results.update(statistics={"resampled": one})
+        )
+        for number, one in enumerate(drawn)
+    ]
+    assert compare_runs(*runs).unit == unit

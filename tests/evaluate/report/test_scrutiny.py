@@ -5,7 +5,7 @@ from __future__ import annotations
 from persist_cli.evaluate.report.page import write_report
 from persist_cli.evaluate.report.pictures import Pictures
 from persist_cli.evaluate.report.result_file import check_results
-from persist_cli.evaluate.report.scrutiny import scrutiny, windows_tables
+from persist_cli.evaluate.report.scrutiny import scrutiny, sharing_clips, windows_tables
 from persist_cli.evaluate.report.terminal import print_results
 from persist_cli.evaluate.report.text import table_text
 from persist_cli.evaluate.windows import window_bounds
@@ -170,3 +170,10 @@ def test_clips_are_said_to_be_picked_by_the_metric_that_picks_them():
     question = "Are the pictures picked?"
     assert "best, median and worst clip by LPIPS" in answers(of_frames)[question].lines[0]
     assert answers(only_sets)[question].lines == ("the first clips of the list in every row",)
+
+
+def test_clips_that_share_no_more_than_a_given_frame_share_no_predicted_one():
+    clip = check_results(example_results(), "example").measured.clips[0]
+    after = clip.model_copy(update={"start": clip.start + clip.frames - 1})
+    assert sharing_clips([clip, after]) == 0
+    assert sharing_clips([clip, clip.model_copy(update={"start": clip.start + clip.frames - 2})]) == 2
