@@ -24,7 +24,7 @@ def clip_seed(seed: int, clip: int) -> int:
 def nth_seed(seed: int, number: int, most: int) -> int:
     """Return another seed for each seed and each number below ``most``, of 32 bits.
 
-    Generators of the CPU take no more of a seed. Where the two do not fit it is a hash of them, and equal ones are rare.
+    Generators of the CPU take no more. Where the two do not fit it is a hash of them, and equal ones are rare.
     """
     distinct = seed * most + number
     return distinct if distinct < 2**32 else int(np.random.SeedSequence((seed, number)).generate_state(1)[0])
