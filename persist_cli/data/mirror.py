@@ -150,11 +150,11 @@ def _alone(address: str, folder: Path) -> Iterator[None]:
     """Within the block no other process lists the address, where the file system of the mirror has locks."""
     from filelock import FileLock, Timeout
 
-    lock = FileLock(folder / LOCK)
+    lock = FileLock(folder / LOCK, fallback_to_soft=False)  # a soft one outlives a process that is killed
     try:
         lock.acquire(timeout=0)
     except Timeout:
-        with busy(f"waiting for another process that lists {address}"):
+        with busy(f"waiting for another process that lists {address} (it has locked {folder / LOCK})"):
             lock.acquire()
     except OSError:
         pass  # the file system has no locks

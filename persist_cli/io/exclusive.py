@@ -18,7 +18,7 @@ def exclusive(folder: Path, main: bool = True) -> Iterator[None]:
     """Within the block no other command may write into a folder: two would delete what the other one has begun.
 
     The folder is made where it is missing, and removed again when the block leaves nothing in it. Where the file system
-    has no locks, nobody is refused.
+    has no locks, nobody is refused: a file that only lies there would outlive a command that was killed.
 
     Args:
         folder: the folder.
@@ -33,18 +33,21 @@ def exclusive(folder: Path, main: bool = True) -> Iterator[None]:
     from filelock import FileLock, Timeout
 
     with made_folder(folder):
-        lock = FileLock(folder / LOCK, timeout=0, mode=0o666)  # another user's command shall find it taken
+        # another user's command shall find it taken
+        lock = FileLock(folder / LOCK, timeout=0, mode=0o666, fallback_to_soft=False)
         try:
             lock.acquire()
         except Timeout as error:
             raise PersistError(
-                f"{folder}: another command is writing there; wait until it has ended, or choose another --out"
+                f"{folder}: another command is writing there (it has locked {folder / LOCK}); wait until it has ended, "
+                "or choose another --out"
             ) from error
         except PermissionError as error:
             if (folder / LOCK).exists():
                 raise PersistError(f"{folder / LOCK}: another user's; wait until that command has ended") from error
-        except OSError:
-            pass  # the file system has no locks
+        except OSError:  # the file system has no locks
+            with contextlib.suppress(OSError):
+                (folder / LOCK).unlink()
         try:
             yield
         finally:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import signal
 import subprocess
 import sys
@@ -38,7 +40,9 @@ def test_who_comes_second_is_refused_and_leaves_the_folder_as_it_is(elsewhere, t
     folder = tmp_path / "run"
     (folder / "kept").touch()
     with (
-        pytest.raises(PersistError, match="run: another command is writing there; wait until it has ended"),
+        pytest.raises(
+            PersistError, match=r"another command is writing there \(it has locked .*run/\.lock\); wait"
+        ),
         exclusive(folder),
     ):
         pytest.fail("two have it")
@@ -68,14 +72,21 @@ def test_a_folder_that_was_made_for_nothing_is_removed_again(tmp_path):
     assert (tmp_path / "empty").is_dir()
 
 
-def test_where_the_file_system_has_no_locks_nobody_is_refused(tmp_path, monkeypatch):
-    def fail(*_: object, **__: object) -> None:
-        raise OSError(95, "not supported")
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no flock")
+@pytest.mark.parametrize("code", [errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK])
+def test_where_the_file_system_has_no_locks_nobody_is_refused(tmp_path, monkeypatch, code):
+    def flock(*_: object) -> None:
+        raise OSError(code, os.strerror(code))
 
-    monkeypatch.setattr("filelock.FileLock.acquire", fail)
-    with exclusive(tmp_path / "run"), exclusive(tmp_path / "run"):
-        (tmp_path / "run" / "result").touch()
+    monkeypatch.setattr("fcntl.flock", flock)
+    with exclusive(tmp_path / "run"):
+        assert not (tmp_path / "run" / LOCK).exists()  # nothing is left when this command is killed
+        with exclusive(tmp_path / "run"):
+            (tmp_path / "run" / "result").touch()
     assert [path.name for path in (tmp_path / "run").iterdir()] == ["result"]
+    with exclusive(tmp_path / "new"):
+        pass
+    assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize(
@@ -90,8 +101,9 @@ def test_where_the_file_system_has_no_locks_nobody_is_refused(tmp_path, monkeypa
 )
 def test_commands_that_go_on_in_a_folder_have_it_alone(elsewhere, persist, tmp_path, command):
     refused = persist(*command.split(), "--out", tmp_path / "run")
-    why = "another command is writing there; wait until it has ended, or choose another --out"
-    assert (refused.code, refused.err) == (1, f"error: {tmp_path}/run: {why}\n")
+    why = f"another command is writing there (it has locked {tmp_path}/run/{LOCK})"
+    advice = "wait until it has ended, or choose another --out"
+    assert (refused.code, refused.err) == (1, f"error: {tmp_path}/run: {why}; {advice}\n")
     assert [path.name for path in (tmp_path / "run").iterdir()] == [LOCK]
 
 
