@@ -11,18 +11,19 @@ import re
 import shutil
 import time
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from persist_cli.errors import CheckpointError, PersistError
-from persist_cli.io.checksums import CHECKSUM, is_verified, is_whole, tensor_bytes, tensor_checksum
+from persist_cli.io.checksums import CHECKSUM, is_verified, is_whole, tensor_bytes, tensor_checksum, with_row_checksums
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
 ASIDE: Final = ".partial-"  # the beginning of the names of files and folders that are being written
+DAMAGED: Final = "damaged, its checksum is wrong; take a whole copy, or make it anew"
 ENVIRONMENT: Final = "PERSIST_REFERENCE"  # a folder that holds the bundled model and data instead of the package
 
 
@@ -160,20 +161,37 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     Raises:
         CheckpointError: one line when the file is missing, truncated, not safetensors, or differs from its checksum.
     """
+    tensors, metadata = _copied(path, lambda tensor: tensor.clone())
+    if is_verified(path) and not is_whole(tensors, metadata):
+        raise CheckpointError(f"{path}: {DAMAGED}")
+    metadata.pop(CHECKSUM, None)
+    return tensors, metadata
+
+
+def read_rows(path: Path, rows: Sequence[int]) -> dict[str, Tensor]:
+    """Rows of the tensors of a file that ``with_row_checksums`` gave; no more of it is read, however large it is.
+
+    Raises:
+        CheckpointError: as from ``read_tensors``, where one of these rows differs from its checksum.
+    """
+    tensors, _ = _copied(path, lambda tensor: tensor[list(rows)])
+    checksums = tensors.pop(CHECKSUM)
+    if not checksums.equal(with_row_checksums(tensors)[CHECKSUM]):
+        raise CheckpointError(f"{path}: {DAMAGED}")
+    return tensors
+
+
+def _copied(path: Path, copy: Callable[[Tensor], Tensor]) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Copies of the tensors of a safetensors file, which is mapped and read no further than they need, and metadata."""
     from safetensors import SafetensorError, safe_open
 
     if not path.is_file():
         raise CheckpointError(f"{path}: no such file")
     try:
         with safe_open(path, framework="pt") as file:
-            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
-            metadata = dict(file.metadata() or {})
+            return {name: copy(file.get_tensor(name)) for name in file.keys()}, dict(file.metadata() or {})  # noqa: SIM118
     except (SafetensorError, ValueError, OSError) as error:
         raise CheckpointError(f"{path}: not a whole safetensors file ({str(error).splitlines()[0]})") from error
-    if is_verified(path) and not is_whole(tensors, metadata):
-        raise CheckpointError(f"{path}: damaged, its checksum is wrong; take a whole copy, or make it anew")
-    metadata.pop(CHECKSUM, None)
-    return tensors, metadata
 
 
 def load_exactly(module: nn.Module, tensors: dict[str, Tensor], names: set[str], path: Path) -> None:

@@ -64,10 +64,14 @@ class KeptFeatures(Encoder):
             features |= dict(zip(missing, encoded, strict=True))
             if not encoded.is_meta:  # there is nothing to keep
                 self.keep(missing, encoded)
+        self.renew(digests)
+        return torch.stack([features[digest] for digest in digests])
+
+    def renew(self, digests: Iterable[bytes]) -> None:
+        """Let the features of frames with these digests, as far as they are kept, leave after all others."""
         for digest in digests:
             if digest in self._kept:
                 self._kept.move_to_end(digest)
-        return torch.stack([features[digest] for digest in digests])
 
     def keep(self, digests: Iterable[bytes], features: Float[Tensor, "frame rows columns channel"]) -> None:
         """Keep the features of frames with these digests."""
@@ -75,6 +79,7 @@ class KeptFeatures(Encoder):
             if digest not in self._kept:
                 self._kept[digest] = frame.detach().cpu().clone()
                 self.used += frame.nbytes
+            self._kept.move_to_end(digest)
         while self.used > self.room:
             _, oldest = self._kept.popitem(last=False)
             self.used -= oldest.nbytes

@@ -109,7 +109,7 @@ class CacheKeys:
             clip["view"] = frames.view.to_json()
         latents = tokens = memory = None
         if self.whole(frames):
-            latents = cache_key(clip | {"frames": "all"} | self.latents)
+            latents = cache_key(clip | {"frames": "all", "rows": "frames"} | self.latents)
         elif self.repeats:
             latents = cache_key(clip | self.latents)
         if self.repeats and self.tokens is not None:
@@ -153,15 +153,11 @@ class ClipCache:
     def latents(self, frames: ClipFrames) -> ClipLatents | None:
         """The latents of a clip, ``None`` where the cache has none."""
         key = self.keys.of_clip(frames).latents
-        tensors = None if key is None else self.cache.get(key)
+        rows = frames.frames if self.keys.whole(frames) else None
+        tensors = None if key is None else self.cache.get(key, rows)
         if tensors is None:
             return None
-        return self.clip_latents(tensors["video"], frames) if self.keys.whole(frames) else ClipLatents(**tensors)
-
-    def clip_latents(self, trajectory: Tensor, frames: ClipFrames) -> ClipLatents:
-        """The latents of a clip out of those of its whole trajectory, in which every frame was encoded alone."""
-        video = trajectory[list(frames.frames)]
-        return ClipLatents(video, video[:1])
+        return ClipLatents(**tensors) if rows is None else framewise_latents(tensors["video"])
 
     def tokens(self, frames: ClipFrames) -> MemoryTokens | None:
         """The memory tokens of a clip, ``None`` where the cache has none."""
@@ -183,9 +179,10 @@ class ClipCache:
     def put_latents(self, frames: ClipFrames, latents: ClipLatents) -> None:
         """Store the latents of a clip, or of its whole trajectory, while there is room."""
         key = self.keys.of_clip(frames).latents
-        if key is not None:
-            tensors = {"video": latents.video} | ({} if self.keys.whole(frames) else {"image": latents.image})
-            self.cache.put(key, tensors)
+        if key is not None and self.keys.whole(frames):
+            self.cache.put_rows(key, {"video": latents.video})
+        elif key is not None:
+            self.cache.put(key, {"video": latents.video, "image": latents.image})
 
     def put_tokens(self, frames: ClipFrames, tokens: MemoryTokens) -> None:
         """Store the memory tokens of a clip while there is room."""
@@ -280,9 +277,9 @@ class ClipEncoder:
         return replace(clip, tokens=tokens)
 
     def bring_features(self, frames: ClipFrames) -> None:
-        """Let a costly encoder know the features of a clip's trajectory, where the cache keeps them."""
+        """Let a costly encoder know the features of a clip's context, where the cache keeps them."""
         if self.cache is not None and self.cache.features is not None and frames.view is None:
-            self.cache.features.bring(frames.file, self.cache.keys.file_hash(frames.file))
+            self.cache.features.bring(frames.file, self.cache.keys.file_hash(frames.file), frames.context)
 
     def _new_latents(self, clip: Clip, frames: ClipFrames) -> ClipLatents:
         if self.cache is None or self.cache.cache.full:  # a whole trajectory would be encoded again for each clip
@@ -296,13 +293,18 @@ class ClipEncoder:
             return known
         pieces = Source(frames.file, range(len(frames.file)), str(frames.file.path)).pieces()
         video = torch.cat([self.encode(replace(clip, observations=piece)).video for piece in pieces])
-        self.cache.put_latents(frames, ClipLatents(video, video[:1]))
-        return self.cache.clip_latents(video, frames)
+        self.cache.put_latents(frames, framewise_latents(video))
+        return framewise_latents(video[list(frames.frames)])
 
     def encode(self, clip: Clip) -> ClipLatents:
         """Latents of these frames, on the CPU."""
         with torch.no_grad(), self.accelerator.autocast():
             return self.backbone.encode(Clips.stack([clip]))[0].to("cpu")
+
+
+def framewise_latents(video: Tensor) -> ClipLatents:
+    """Latents of a codec that codes every frame alone, in which the first frame is what it is by itself."""
+    return ClipLatents(video, video[:1])
 
 
 def _token_dependencies(memory: MemoryConfig, factory: MemoryFactory, backbone: Backbone) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Final
 
 import torch
@@ -11,7 +12,7 @@ from persist_cli.memorize.kept_features import KeptFeatures, frame_digests
 from persist_cli.memorize.sources import Source
 from persist_cli.train.tensor_cache import TensorCache, cache_key
 
-FRAMES: Final = "frames"  # the tensor of the frames' digests in an entry; the other one has their features
+FRAMES: Final = "frames"  # the tensor of the frames' digests in an entry; another one has their features
 
 
 class FeatureCache:
@@ -25,26 +26,32 @@ class FeatureCache:
 
     def __init__(self, cache: TensorCache, depends: dict[str, Any], encoder: KeptFeatures) -> None:
         self.cache, self.depends, self.encoder = cache, depends, encoder
-        self._digests: dict[str, list[bytes]] = {}  # of the frames of each trajectory that was brought
+        self._digests: dict[tuple[str, int], bytes] = {}  # of each frame that was brought, by entry and number
 
-    def bring(self, file: TrajectoryFile, file_hash: str) -> None:
-        """Let the encoder have the features of all frames of a trajectory, as far as it has room and the folder too.
+    def bring(self, file: TrajectoryFile, file_hash: str, frames: Sequence[int]) -> None:
+        """Let the encoder have the features of some frames, as far as it has room and the folder too.
 
         Args:
             file: the trajectory.
             file_hash: SHA-256 of its file.
+            frames: numbers of the frames; the first of a trajectory that are brought have all its frames encoded.
         """
-        key = cache_key({"trajectory": file_hash} | self.depends)
-        if key in self._digests and all(digest in self.encoder for digest in self._digests[key]):
+        key = cache_key({"trajectory": file_hash, "rows": "frames"} | self.depends)
+        digests = {frame: self._digests.get((key, frame), b"") for frame in frames}
+        missing = [frame for frame, digest in digests.items() if digest not in self.encoder]
+        self.encoder.renew(digests.values())  # the missing ones shall not take their place
+        if not missing:
             return
-        tensors = self.cache.get(key)
+        tensors = self.cache.get(key, missing)
         if tensors is None:
             if self.cache.full:  # a whole trajectory would be encoded again for each clip
                 return
             tensors = self._encode(file)
-            self.cache.put(key, tensors)
-        self._digests[key] = [bytes(row.tolist()) for row in tensors[FRAMES]]
-        self.encoder.keep(self._digests[key], tensors["features"])
+            self.cache.put_rows(key, tensors)
+            tensors = {name: tensor[missing] for name, tensor in tensors.items()}
+        brought = [bytes(row.tolist()) for row in tensors[FRAMES]]
+        self._digests |= {(key, frame): digest for frame, digest in zip(missing, brought, strict=True)}
+        self.encoder.keep(brought, tensors["features"])
 
     def _encode(self, file: TrajectoryFile) -> dict[str, torch.Tensor]:
         digests: list[bytes] = []

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -18,7 +18,8 @@ from typing import Any, Final
 from torch import Tensor
 
 from persist_cli.errors import CheckpointError, PersistError
-from persist_cli.io.files import ASIDE, read_tensors, remove_leftovers, write_tensors
+from persist_cli.io.checksums import with_row_checksums
+from persist_cli.io.files import ASIDE, read_rows, read_tensors, remove_leftovers, write_tensors
 from persist_cli.output.console import say
 
 FORMAT: Final = 3  # of the entries; those of another format are not found
@@ -77,17 +78,25 @@ class TensorCache:
         """The file of an entry, which need not exist; entries are spread over 256 folders."""
         return self.folder / key[:2] / f"{key}.safetensors"
 
-    def get(self, key: str) -> dict[str, Tensor] | None:
-        """The tensors of an entry, ``None`` when there is none; a damaged one is removed, and a line says so."""
+    def get(self, key: str, rows: Sequence[int] | None = None) -> dict[str, Tensor] | None:
+        """The tensors of an entry, ``None`` when there is none; a damaged one is removed, and a line says so.
+
+        Args:
+            key: of the entry.
+            rows: of the tensors of an entry of ``put_rows``, of which no more is read.
+        """
         path = self.path(key)
         if not path.is_file():
             return None
         try:
-            tensors, _ = read_tensors(path)
+            return read_tensors(path)[0] if rows is None else read_rows(path, rows)
         except CheckpointError as error:
             self._remove(path, str(error))
             return None
-        return tensors
+
+    def put_rows(self, key: str, tensors: Mapping[str, Tensor]) -> None:
+        """Store an entry of which single rows are read, as of a trajectory of which a clip needs some frames."""
+        self.put(key, with_row_checksums(tensors))
 
     def put(self, key: str, tensors: Mapping[str, Tensor]) -> None:
         """Store an entry while there is room; once the folder cannot be written, nothing more is stored."""

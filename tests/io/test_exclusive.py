@@ -40,9 +40,7 @@ def test_who_comes_second_is_refused_and_leaves_the_folder_as_it_is(elsewhere, t
     folder = tmp_path / "run"
     (folder / "kept").touch()
     with (
-        pytest.raises(
-            PersistError, match=r"another command is writing there \(it has locked .*run/\.lock\); wait"
-        ),
+        pytest.raises(PersistError, match=r"another command is writing there \(it has locked .*run/\.lock\); wait"),
         exclusive(folder),
     ):
         pytest.fail("two have it")

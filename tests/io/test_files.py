@@ -15,11 +15,13 @@ from persist_backbones.pipeline.pipeline import WorldPipeline
 from persist_cli.checkpoints import save
 from persist_cli.errors import CheckpointError, PersistError
 from persist_cli.io import files
+from persist_cli.io.checksums import with_row_checksums
 from persist_cli.io.files import (
     ASIDE,
     check_folder,
     folder_aside,
     read_json,
+    read_rows,
     read_tensors,
     relative_place,
     remove_leftovers,
@@ -75,6 +77,17 @@ def test_tensors_are_read_into_memory_that_torch_allocated(tmp_path):
 
 
 TYPES = [torch.float64, torch.float32, torch.float16, torch.bfloat16, torch.int64, torch.uint8, torch.bool]
+
+
+def test_rows_of_tensors_are_read_and_a_damaged_one_is_noticed_where_it_is_read(tmp_path):
+    path = tmp_path / "a.safetensors"
+    tensors = {"a": torch.arange(12.0).reshape(4, 3), "b": torch.arange(4).bfloat16()}
+    write_tensors(path, with_row_checksums(tensors))
+    assert all(torch.equal(rows, tensors[name][[3, 1]]) for name, rows in read_rows(path, [3, 1]).items())
+    path.write_bytes(path.read_bytes().replace(tensors["a"][2].numpy().tobytes(), bytes(12)))
+    assert torch.equal(read_rows(path, range(2))["a"], tensors["a"][:2])
+    with pytest.raises(CheckpointError, match="damaged, its checksum is wrong"):
+        read_rows(path, [1, 2])
 
 
 def test_the_safetensors_package_reads_what_is_written(tmp_path):

@@ -127,7 +127,7 @@ def test_each_trajectory_is_encoded_once_and_contexts_that_never_come_again_have
         assert persist(*cached).code == 0
         assert equal_runs(tmp_path / "without", tmp_path / name)
     names = [sorted(read_tensors(path)[0]) for path in entries(tmp_path / "cache")]
-    assert names == [["features", "frames"]] * 2  # trajectories; no clip's latents or tokens
+    assert names == [["checksum", "features", "frames"]] * 2  # trajectories; no clip's latents or tokens
 
 
 def test_with_a_full_cache_only_the_clip_is_encoded_and_not_its_trajectory(persist, walks, tmp_path):
