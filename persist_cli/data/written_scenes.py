@@ -8,7 +8,6 @@ from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any, Final, Protocol
 
 import numpy as np
@@ -20,6 +19,7 @@ from persist_cli.api.encoder import Encoder
 from persist_cli.api.memory import FrameOfReference
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.api.scene import Scene
+from persist_cli.data.file_hashes import FileHashes
 from persist_cli.data.store import TrajectoryFile
 from persist_cli.data.stored_cells import CellBox, encode_cells
 from persist_cli.errors import PluginError
@@ -31,7 +31,9 @@ MOST_KEPT: Final = 2000  # of the latest scenes, about 30 kB each, when there is
 
 
 class TensorStore(Protocol):
-    """A cache of tensors by key."""
+    """A cache of tensors by key, and of the hashes of files that they are made of."""
+
+    hashes: FileHashes
 
     def get(self, key: str) -> dict[str, Tensor] | None:
         """Return the tensors of a key, ``None`` where they are not kept."""
@@ -63,7 +65,7 @@ class SceneWriter:
 
     def __init__(self, form: CellForm, cache: TensorStore | None = None) -> None:
         self.form, self.cache = form, cache
-        self._hashes: dict[Path, str] = {}  # of trajectories' files
+        self._hashes = FileHashes() if cache is None else cache.hashes
         self._latest: OrderedDict[str, dict[str, Tensor]] = OrderedDict()
 
     def scene(self, file: TrajectoryFile, frames: Sequence[int]) -> WrittenScene:
@@ -113,9 +115,7 @@ class SceneWriter:
 
     def _key(self, file: TrajectoryFile, frames: Sequence[int]) -> str:
         """A hash of all that a scene depends on."""
-        if file.path not in self._hashes:
-            self._hashes[file.path] = file.sha256
-        depends = [FORMAT, self._version, asdict(self.form), self._hashes[file.path], *frames]
+        depends = [FORMAT, self._version, asdict(self.form), self._hashes.of(file), *frames]
         return hashlib.sha256(json.dumps(depends).encode()).hexdigest()
 
     def _kept(self, key: str) -> dict[str, Tensor] | None:

@@ -6,7 +6,6 @@ import dataclasses
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, Final
 
 import torch
@@ -24,7 +23,7 @@ from persist_cli.api.scene import Scene
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.checkpoints.scene_models import find_scene_model
 from persist_cli.data.clips import ClipDataset, ClipFrames, ClipSample
-from persist_cli.data.store import TrajectoryFile
+from persist_cli.data.file_hashes import FileHashes
 from persist_cli.data.writing_noise import WritingNoise
 from persist_cli.memorize.factory import MemoryFactory, with_memory
 from persist_cli.memorize.kept_features import KeptFeatures
@@ -65,13 +64,14 @@ class CacheKeys:
         tokens: the JSON values that memory tokens depend on besides the clip, ``None`` without a memory.
         whole_trajectories: whether an entry has the latents of a whole trajectory instead of a clip.
         repeats: whether clips come again, with the same contexts.
+        hashes: those of the trajectories' files.
     """
 
     latents: dict[str, Any]
     tokens: dict[str, Any] | None
     whole_trajectories: bool
     repeats: bool = True
-    hashes: dict[Path, str] = field(default_factory=dict)  # of the trajectories' files, each computed once
+    hashes: FileHashes = field(default_factory=FileHashes)
 
     @staticmethod
     def of(recipe: Recipe, backbone: Backbone, factory: MemoryFactory | None, device: str, precision: str) -> CacheKeys:
@@ -104,7 +104,7 @@ class CacheKeys:
 
     def of_clip(self, frames: ClipFrames) -> ClipKeys:
         """The keys of a clip."""
-        clip: dict[str, Any] = {"trajectory": self.file_hash(frames.file), "frames": list(frames.frames)}
+        clip: dict[str, Any] = {"trajectory": self.hashes.of(frames.file), "frames": list(frames.frames)}
         if frames.view is not None:
             clip["view"] = frames.view.to_json()
         latents = tokens = memory = None
@@ -119,12 +119,6 @@ class CacheKeys:
             tokens = cache_key(clip | context | self.tokens)
             memory = cache_key(clip | {"frames": "memory"} | context | self.tokens)
         return ClipKeys(latents, tokens, memory)
-
-    def file_hash(self, file: TrajectoryFile) -> str:
-        """The SHA-256 of a trajectory's file."""
-        if file.path not in self.hashes:
-            self.hashes[file.path] = file.sha256
-        return self.hashes[file.path]
 
 
 @dataclass(frozen=True)
@@ -143,7 +137,8 @@ class ClipCache:
 
     @staticmethod
     def of(cache: TensorCache, keys: CacheKeys, factory: MemoryFactory | None) -> ClipCache:
-        """The cache of a run; a costly encoder's features are kept in it too."""
+        """The cache of a run; a costly encoder's features and the hashes of files are kept in it too."""
+        keys = replace(keys, hashes=cache.hashes)
         encoder = None if factory is None else factory.encoder
         if not isinstance(encoder, KeptFeatures) or keys.tokens is None:
             return ClipCache(cache, keys)
@@ -279,7 +274,7 @@ class ClipEncoder:
     def bring_features(self, frames: ClipFrames) -> None:
         """Let a costly encoder know the features of a clip's context, where the cache keeps them."""
         if self.cache is not None and self.cache.features is not None and frames.view is None:
-            self.cache.features.bring(frames.file, self.cache.keys.file_hash(frames.file), frames.context)
+            self.cache.features.bring(frames.file, frames.context)
 
     def _new_latents(self, clip: Clip, frames: ClipFrames) -> ClipLatents:
         if self.cache is None or self.cache.cache.full:  # a whole trajectory would be encoded again for each clip

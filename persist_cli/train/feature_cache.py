@@ -28,15 +28,14 @@ class FeatureCache:
         self.cache, self.depends, self.encoder = cache, depends, encoder
         self._digests: dict[tuple[str, int], bytes] = {}  # of each frame that was brought, by entry and number
 
-    def bring(self, file: TrajectoryFile, file_hash: str, frames: Sequence[int]) -> None:
+    def bring(self, file: TrajectoryFile, frames: Sequence[int]) -> None:
         """Let the encoder have the features of some frames, as far as it has room and the folder too.
 
         Args:
             file: the trajectory.
-            file_hash: SHA-256 of its file.
             frames: numbers of the frames; the first of a trajectory that are brought have all its frames encoded.
         """
-        key = cache_key({"trajectory": file_hash, "rows": "frames"} | self.depends)
+        key = cache_key({"trajectory": self.cache.hashes.of(file), "rows": "frames"} | self.depends)
         digests = {frame: self._digests.get((key, frame), b"") for frame in frames}
         missing = [frame for frame, digest in digests.items() if digest not in self.encoder]
         self.encoder.renew(digests.values())  # the missing ones shall not take their place

@@ -3,7 +3,7 @@
 An entry is a safetensors file. Its name is its key: a hash of data, weights, settings and versions of packages, on
 which its content depends. When code changes and its version does not, the folder must be removed by hand. Two processes
 may write an entry at once, because both write the same, aside, and then rename it. Once the folder is full nothing more
-is stored; entries are never replaced.
+is stored; entries are never replaced. The hashes of data files, of a line each, lie beside them and do not count.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Any, Final
 
 from torch import Tensor
 
+from persist_cli.data.file_hashes import FileHashes
 from persist_cli.errors import CheckpointError, PersistError
 from persist_cli.io.checksums import with_row_checksums
 from persist_cli.io.files import ASIDE, read_rows, read_tensors, remove_leftovers, write_tensors
@@ -59,7 +60,7 @@ class TensorCache:
         self.folder, self.limit = settings.folder, settings.gigabytes * 1e9
         if not self.limit >= 0:
             raise PersistError(f"--cache-gigabytes is {settings.gigabytes}; it must be a number of at least 0")
-        self.full = False
+        self.full, self.hashes = False, FileHashes(self.folder)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:

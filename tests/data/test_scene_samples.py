@@ -17,6 +17,7 @@ from persist_cli.api.geometry import unproject
 from persist_cli.api.reach import CHANGED
 from persist_cli.api.scene_model import Given, SceneForm, SceneSamples
 from persist_cli.api.scene_turns import Turn
+from persist_cli.data.file_hashes import FileHashes
 from persist_cli.data.scene_samples import SampleShares, SceneSampleDataset
 from persist_cli.data.store import write_trajectory
 from persist_cli.errors import DataError
@@ -192,6 +193,8 @@ def test_an_interaction_with_nothing_changes_nothing(houses: Path) -> None:
 
 class Shelf(dict[str, Any]):
     """A cache in memory."""
+
+    hashes = FileHashes()
 
     def put(self, key: str, tensors: Any) -> None:
         self[key] = tensors

@@ -8,6 +8,8 @@ import pytest
 import torch
 
 from persist_cli.api.observations import Frame
+from persist_cli.data import store
+from persist_cli.data.file_hashes import FileHashes
 from persist_cli.data.store import Store, TrajectoryFile, write_trajectory
 from persist_cli.data.written_scenes import SceneWriter
 from tests.support.cell_houses import FORM, write_cell_houses
@@ -17,6 +19,10 @@ class Kept(dict[str, dict[str, torch.Tensor]]):
     """A cache in memory."""
 
     put = dict.__setitem__
+
+    @property
+    def hashes(self) -> FileHashes:
+        return FileHashes()  # of a process of its own
 
 
 def house(folder: Path, size: int) -> TrajectoryFile:
@@ -42,6 +48,15 @@ def test_a_kept_scene_is_not_taken_for_that_of_a_file_whose_depth_was_mended(tmp
     known = SceneWriter(FORM, kept).scene(mended, [3]).known
     assert torch.equal(known.classes, SceneWriter(FORM).scene(mended, [3]).known.classes)
     assert len(kept) == 2
+
+
+def test_the_hash_of_a_file_is_that_which_the_cache_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kept, file = Kept(), house(tmp_path / "data", 32)
+    monkeypatch.setattr(Kept, "hashes", FileHashes())
+    SceneWriter(FORM, kept).scene(file, [3])
+    monkeypatch.delattr(store, "file_sha256")
+    SceneWriter(FORM, kept).scene(file, [3])
+    assert len(kept) == 1
 
 
 def test_a_kept_scene_is_taken_again(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from persist_cli.api.clips import ClipLatents
 from persist_cli.api.encoder import Encoder
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.checkpoints.load import adapter_memory, load_backbone
+from persist_cli.data import file_hashes, store
 from persist_cli.data.augment import View
 from persist_cli.data.clips import ClipDataset, ClipPlan
 from persist_cli.errors import PersistError
@@ -260,6 +261,17 @@ def clips_in(walks: Path, folder: Path, **changes: object) -> CachedClips:
     clips = ClipDataset([walks], ClipPlan(**plan, clips_per_trajectory=2))
     keys = CacheKeys(latents={"encoding": "x"}, tokens={"memory": "y"}, whole_trajectories=False)
     return CachedClips(clips, ClipCache(TensorCache(CacheSettings(folder, 1)), keys))
+
+
+def test_runs_that_share_a_cache_hash_a_data_file_once(walks, tmp_path, monkeypatch):
+    hashed = []
+    monkeypatch.setattr(file_hashes, "RACY", -1.0)
+    monkeypatch.setattr(store, "file_sha256", lambda path: hashed.append(path) or "0" * 64)
+    for _ in range(2):
+        clips = clips_in(walks, tmp_path / "other")
+        cache = ClipCache.of(TensorCache(CacheSettings(tmp_path / "cache", 1)), clips.cache.keys, None)
+        cache.latents(clips.clips.choose(0))
+    assert len(hashed) == 1
 
 
 def test_no_image_of_a_cached_clip_is_read(walks, tmp_path):

@@ -56,16 +56,16 @@ def feature_cache(folder: Path, file: TrajectoryFile, frames: int) -> FeatureCac
 def test_the_features_of_contexts_are_read_though_there_is_no_room_for_those_of_the_trajectory(file, tmp_path, reads):
     cache = feature_cache(tmp_path, file, frames=6)
     for context in (range(6), range(6, 12), [11, 0, 3], range(6)):
-        cache.bring(file, "hash", context)
+        cache.bring(file, context)
         assert torch.equal(cache.encoder.encode(file.rgb(context)), PLAIN.encode(file.rgb(context)))
     assert cache.encoder.encoder.frames == len({*frame_digests(file.rgb(range(len(file))))})
     assert reads == [0, 6, 2, 4]
 
 
 def test_another_process_reads_the_same_features_and_encodes_none(file, tmp_path, reads):
-    feature_cache(tmp_path, file, frames=6).bring(file, "hash", [0])
+    feature_cache(tmp_path, file, frames=6).bring(file, [0])
     cache = feature_cache(tmp_path, file, frames=6)
-    cache.bring(file, "hash", [5, 2])
+    cache.bring(file, [5, 2])
     assert torch.equal(cache.encoder.encode(file.rgb([2, 5])), PLAIN.encode(file.rgb([2, 5])))
     assert (cache.encoder.encoder.frames, reads) == (0, [0, 2])
 
@@ -73,18 +73,18 @@ def test_another_process_reads_the_same_features_and_encodes_none(file, tmp_path
 def test_features_that_a_context_has_do_not_leave_for_those_that_it_lacks(file, tmp_path, reads):
     cache = feature_cache(tmp_path, file, frames=4)
     for context in ([11, 0, 1, 2], [11, 8, 9], [11]):
-        cache.bring(file, "hash", context)
+        cache.bring(file, context)
     assert reads == [0, 2]
 
 
 def test_features_that_are_damaged_are_made_anew(file, tmp_path, capsys):
-    feature_cache(tmp_path, file, frames=6).bring(file, "hash", [0])
+    feature_cache(tmp_path, file, frames=6).bring(file, [0])
     (entry,) = tmp_path.glob("*/*.safetensors")
     whole, place = entry.read_bytes(), PLAIN.encode(file.rgb(range(8)))[3].numpy().tobytes()
     first = whole.index(place)
     entry.write_bytes(whole[:first] + bytes([whole[first] ^ 1]) + whole[first + 1 :])
     cache = feature_cache(tmp_path, file, frames=6)
-    cache.bring(file, "hash", [2, 3])
+    cache.bring(file, [2, 3])
     assert "its checksum is wrong" in capsys.readouterr().out
     assert torch.equal(cache.encoder.encode(file.rgb([2, 3])), PLAIN.encode(file.rgb([2, 3])))
     assert entry.read_bytes() == whole
