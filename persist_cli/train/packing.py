@@ -7,12 +7,17 @@ small tensors would take longer to hand over than to read.
 from __future__ import annotations
 
 import io
+import math
+import os
 import pickle
 from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.utils.data import get_worker_info
+
+from persist_cli.errors import PersistError
 
 ALIGNMENT: Final = 16  # bytes; the largest element of a tensor
 
@@ -75,6 +80,32 @@ def pack(samples: Sequence[Any]) -> PackedSamples:
     for tensor, place in zip(packer.tensors, places, strict=True):
         together[place.start : place.start + tensor.nbytes] = tensor.view(-1).view(torch.uint8)
     return PackedSamples(file.getvalue(), together, places)
+
+
+def pack_shared(samples: Sequence[Any]) -> PackedSamples:
+    """Pack samples into memory that processes share; a ``PersistError`` stands in their place where it has no room.
+
+    When torch puts them there, as it sends them, it drops those that find no room, and they are waited for without end.
+    """
+    packed = pack(samples)
+    try:
+        packed.tensors.share_memory_()
+    except RuntimeError as error:
+        return pack([PersistError(no_room(packed.tensors.nbytes, error))])
+    return packed
+
+
+def no_room(size: int, error: RuntimeError) -> str:
+    """Say that a batch of so many bytes finds no room in shared memory, and how much there should be."""
+    info = get_worker_info()
+    workers = info.num_workers if info is not None else 1
+    batches = (2 * workers + 2) * int(os.environ.get("LOCAL_WORLD_SIZE", "1"))  # torch reads two a process ahead
+    cause = str(error).rsplit(": ", 1)[-1]
+    return (
+        f"a batch of {size / 1e6:,.1f} MB finds no room in shared memory, /dev/shm ({cause}); {batches} may be there "
+        f"at once: run the container with --ipc=host or --shm-size={math.ceil(batches * size / 1e9)}g, elsewhere "
+        "enlarge it, or train with fewer training.workers (0 needs none)"
+    )
 
 
 def unpack(packed: PackedSamples) -> list[Any]:

@@ -10,10 +10,11 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import dataclass
+from datetime import timedelta
 from multiprocessing import resource_tracker
 from pathlib import Path
 from types import FrameType
-from typing import Any, Generic, TypeVar, cast
+from typing import Any, Final, Generic, TypeVar, cast
 
 import torch
 from accelerate import Accelerator
@@ -31,11 +32,13 @@ from persist_cli.recipe import Recipe
 from persist_cli.train.distributed import Sharding, ZeroState, is_sharded, unflattened, uses_zero
 from persist_cli.train.log import StepLog, StepTimes
 from persist_cli.train.optimizer import Opponent, make_average, make_optimizer, set_learning_rate, update_average
-from persist_cli.train.packing import pack, unpack
+from persist_cli.train.packing import pack_shared, unpack
 from persist_cli.train.state import TrainingState
 from persist_cli.training_settings import TrainingSettings
 
 Model = TypeVar("Model", bound=nn.Module)
+
+LONGEST_READ: Final = timedelta(minutes=30)  # of a batch; other processes wait longer, so that this is what is said
 
 
 @dataclass
@@ -79,6 +82,32 @@ def held_back_signals() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def explain_lost_readers() -> Iterator[None]:
+    """Replace torch's error about a process that reads data, and ended or does not answer, by one line.
+
+    Raises:
+        PersistError: that line.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        if not str(error).startswith("DataLoader "):
+            raise
+        raise PersistError(
+            f"a process that reads data was lost ({' '.join(str(error).split())}); check the free memory, and the disk "
+            "or server of the data; training.workers=0 reads without such processes"
+        ) from error
+
+
+def end_readers(batches: Any) -> None:
+    """End the processes of a loader's iterator; also one that hangs, for which the program would wait at its end."""
+    if hasattr(batches, "_shutdown_workers"):
+        batches._shutdown_workers()
+        for reader in batches._workers:
+            reader.kill()  # it outlives the signal that torch sends
 
 
 class CaughtErrors(Dataset[Any]):
@@ -187,7 +216,8 @@ class TrainingLoop(ABC, Generic[Model]):
             CaughtErrors(self.dataset),
             batch_sampler=batches,
             num_workers=settings.workers,
-            collate_fn=pack if settings.workers else list,
+            collate_fn=pack_shared if settings.workers else list,
+            timeout=LONGEST_READ.total_seconds() if settings.workers else 0,
             worker_init_fn=outlive_signals,
             generator=torch.Generator(),  # of its own: the loader must not draw from the run's random state
         )
@@ -205,7 +235,7 @@ class TrainingLoop(ABC, Generic[Model]):
                     raise errors[0]
                 yield self.to_batch(samples)
         finally:
-            del remaining  # its processes end now, and not when the traceback of an error is forgotten
+            end_readers(remaining)  # now, and not when the traceback of an error is forgotten
 
     def first_batches(self, count: int) -> Iterator[Any]:
         """So many batches of the first samples, of which something is measured before or after training."""
@@ -215,7 +245,7 @@ class TrainingLoop(ABC, Generic[Model]):
 
     def steps(self) -> Iterator[dict[str, float]]:
         """Train to the last step; yields the logged values of each optimizer step."""
-        with closing(self.loader()) as batches:
+        with explain_lost_readers(), closing(self.loader()) as batches:
             while self.state.step < self.recipe.training.steps:
                 with self.times.step():
                     values = self.step(batches)
