@@ -50,6 +50,7 @@ from persist_cli.errors import PersistError, RecipeError
 from persist_cli.io.command_line import quoted
 from persist_cli.io.exclusive import exclusive
 from persist_cli.io.files import check_folder
+from persist_cli.io.signals import repeated_signals
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.output.console import busy, say, warn
 from persist_cli.plugins import make_scene_model
@@ -89,7 +90,7 @@ from persist_cli.train.sources import (
 from persist_cli.train.state import load_state
 from persist_cli.train.tensor_cache import CacheSettings
 from persist_cli.train.trainer import Trainer
-from persist_cli.train.training_loop import StopSignal, TrainingLoop
+from persist_cli.train.training_loop import StopSignal, TrainingLoop, end_at_once
 
 LONGEST_WAIT: Final = timedelta(hours=1)  # for a process that does not answer, as while it writes a large model
 
@@ -134,8 +135,8 @@ def run_finetune(plan: FinetunePlan) -> None:
         raise RecipeError(f"{plan.recipe}: no data set; give --data DIR")
     check_run(run, recipe, plan.resume)
     lost = explain_lost_processes(partial(last_checkpoint, run))
-    with StopSignal.awaited() as stop, limited_threads(recipe.training.threads), lost:
-        ended_by = finetune(recipe, run, stop, plan)
+    with repeated_signals(end_at_once), limited_threads(recipe.training.threads), lost:
+        ended_by = finetune(recipe, run, plan)
     if ended_by is not None:
         sys.exit(128 + ended_by)  # as a shell says that a signal ended a command: it must not go on with the next
 
@@ -181,35 +182,36 @@ def check_run(run: Path, recipe: Recipe, resume: bool) -> None:
     check_scene_model(recipe, run)
 
 
-def finetune(recipe: Recipe, run: Path, stop: StopSignal, plan: FinetunePlan) -> int | None:
+def finetune(recipe: Recipe, run: Path, plan: FinetunePlan) -> int | None:
     """Train to the recipe's last step or to a signal, from the run's last checkpoint where there is one.
 
     Args:
         recipe: the resolved recipe.
         run: the run's folder.
-        stop: the signal that asked the run to stop, once there is one.
         plan: the options of the command, of which ``cache`` and ``profile`` are read here.
 
     Returns:
         The signal that ended the run before its last step, ``None`` when it reached that.
     """
     accelerator = make_accelerator(recipe, run)
-    with exclusive(run, accelerator.is_main_process), held_sources(recipe, run) as (recipe, base):
-        with busy("loading model and data"):
-            trainer = prepare_trainer(recipe, run, base, accelerator, plan)
-            folder = prepare_run(trainer, run, base, plan)
-        ended_by = trainer.train(folder.log, folder.save, stop)
-        with busy("saving the checkpoint"):
-            kept = folder.finish()
-    ended_by = ended_by if trainer.state.step < recipe.training.steps else None
-    if accelerator.is_main_process:
-        trainer.times.report(run / "profile.json")
-        report(recipe, run, trainer.state.step, folder.speed.rate())
-        say(f"{len(kept)} checkpoint{'s' * (len(kept) > 1)} kept: {', '.join(map(str, kept))}")
-        if ended_by is None:
-            say(f"next: {next_command(plan.recipe, recipe, run)}")
-    accelerator.wait_for_everyone()  # as soon as one has ended by a signal, a launcher ends the others
-    accelerator.end_training()
+    with contextlib.ExitStack() as from_the_first_step:
+        with exclusive(run, accelerator.is_main_process), held_sources(recipe, run) as (recipe, base):
+            with busy("loading model and data"):  # a signal ends it: there is nothing to save
+                trainer = prepare_trainer(recipe, run, base, accelerator, plan)
+                folder = prepare_run(trainer, run, base, plan)
+            stop = from_the_first_step.enter_context(StopSignal.awaited())
+            ended_by = trainer.train(folder.log, folder.save, stop)
+            with busy("saving the checkpoint"):
+                kept = folder.finish()
+        ended_by = ended_by if trainer.state.step < recipe.training.steps else None
+        if accelerator.is_main_process:
+            trainer.times.report(run / "profile.json")
+            report(recipe, run, trainer.state.step, folder.speed.rate())
+            say(f"{len(kept)} checkpoint{'s' * (len(kept) > 1)} kept: {', '.join(map(str, kept))}")
+            if ended_by is None:
+                say(f"next: {next_command(plan.recipe, recipe, run)}")
+        accelerator.wait_for_everyone()  # as soon as one has ended by a signal, a launcher ends the others
+        accelerator.end_training()
     return ended_by
 
 
