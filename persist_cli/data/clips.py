@@ -255,7 +255,7 @@ class DistributedBatches(BatchSampler):
     def __init__(
         self, first_step: int, last_step: int, batch: int, accumulation: int, process: int, processes: int
     ) -> None:
-        check_batch_division(batch, accumulation, processes)
+        check_batch_division(batch, accumulation, processes, begun=first_step > 0)
         self.first_step, self.last_step, self.batch = first_step, last_step, batch
         self.accumulation, self.process, self.processes = accumulation, process, processes
 
@@ -270,18 +270,24 @@ class DistributedBatches(BatchSampler):
                 yield list(range(first, first + size))
 
 
-def check_batch_division(batch: int, accumulation: int, processes: int) -> None:
+def check_batch_division(batch: int, accumulation: int, processes: int, begun: bool = False) -> None:
     """Raise ``RecipeError`` unless every process gets micro-batches of one size.
 
     Args:
         batch: samples of an optimizer step.
         accumulation: number of micro-batches of an optimizer step.
         processes: number of processes that share each micro-batch.
+        begun: whether the run goes on, which keeps its batch.
     """
     if batch % (accumulation * processes) == 0:
         return
     share = batch // processes
-    if batch % processes:
+    if batch % processes and begun:
+        fewer = max(count for count in range(1, processes) if batch % count == 0)
+        share, samples = batch // fewer, max(1, share // accumulation)  # no more at once than was asked for
+        parts = min(parts for parts in range(1, share + 1) if share % parts == 0 and share // parts <= samples)
+        advice = f"training.accumulation={parts} and launch {fewer} of them: a run that has begun keeps its batch"
+    elif batch % processes:
         advice = f"training.batch={max(1, share) * processes} training.accumulation={max(1, share)}"
     else:
         most = max(parts for parts in range(1, min(accumulation, share) + 1) if share % parts == 0)

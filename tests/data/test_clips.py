@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 
 import pytest
@@ -161,6 +162,17 @@ def test_clips_that_cannot_be_drawn_are_reported_with_the_numbers(walks):
         ClipDataset([walks], plan(image_size=(64, 64)))
     with pytest.raises(RecipeError, match=r"cannot be shared by 3 processes .* give training.batch=6 training.acc"):
         DistributedBatches(0, 1, 8, 1, 0, 3)
+
+
+@pytest.mark.parametrize(("batch", "accumulation", "processes"), [(8, 2, 3), (64, 8, 7), (6, 1, 4), (5, 4, 8)])
+def test_a_run_that_lost_processes_is_told_how_to_keep_its_batch(batch, accumulation, processes):
+    with pytest.raises(RecipeError, match="a run that has begun keeps its batch") as refused:
+        DistributedBatches(1, 2, batch, accumulation, 0, processes)
+    advice = re.search(r"give training.accumulation=(\d+) and launch (\d+) of them", str(refused.value))
+    parts, fewer = int(advice[1]), int(advice[2])
+    sizes = {len(rows) for rows in DistributedBatches(1, 2, batch, parts, 0, fewer)}
+    assert not any(batch % more == 0 for more in range(fewer + 1, processes + 1))
+    assert max(sizes) <= max(1, batch / (accumulation * processes))
 
 
 def test_true_cells_stand_in_the_place_of_a_context_and_are_those_of_the_first_frame(walks, tmp_path):
