@@ -194,6 +194,22 @@ class Backbone(nn.Module, ABC):
         """
         return False
 
+    @classmethod
+    def compute_once(cls, settings: Any, folder: Path, begun: Path | None) -> Any:
+        """Return settings that name files with what takes long to compute of the given ones; by default these.
+
+        The main process of a training calls it, before every process makes its backbone of the result.
+
+        Args:
+            settings: an instance of ``settings_type``.
+            folder: the run's folder, into which such files are written.
+            begun: of a run that goes on, the folder of its newest model, which has what the run began with.
+
+        Raises:
+            PersistError: one line when it cannot be computed.
+        """
+        return settings
+
     def begin_stage(self, stage: Stage, clips: Iterable[Clips]) -> None:
         """Begin a stage that has no base by setting fresh weights from some clips; nothing by default."""
 

@@ -18,6 +18,7 @@ from typing import Any, Final
 from accelerate import PartialState
 from accelerate.utils import broadcast_object_list
 
+from persist_cli.api.backbone import Backbone
 from persist_cli.api.checkpoint import (
     SHOWN,
     STEP,
@@ -34,10 +35,11 @@ from persist_cli.checkpoints.retention import mark_in_use, unmark_in_use
 from persist_cli.checkpoints.save import fingerprint
 from persist_cli.data.reference import data_folder
 from persist_cli.data.store import Store
-from persist_cli.errors import CheckpointError
+from persist_cli.errors import CheckpointError, PersistError
 from persist_cli.io.files import read_json, write_json
 from persist_cli.io.sha256sums import hash_files
 from persist_cli.memorize.imagining import scene_model_fingerprint
+from persist_cli.plugins import load_plugin, make_settings
 from persist_cli.recipe import Recipe, network_of
 
 DISTILLED: Final = "distilled.json"  # in a run's folder: hashes of what it distils, by the recipe's keys
@@ -63,6 +65,29 @@ def with_own_adapter(recipe: Recipe, run: Path) -> Recipe:
     if recipe.adapter_from is None or recipe.distill is not None or not step_folders(run):
         return recipe
     return replace(recipe, adapter_from=str(run))
+
+
+def make_run_backbone(run: Path, name: str, settings: dict[str, Any]) -> Backbone:
+    """Make the fresh backbone of a run; what takes long for it is computed by the main process, once in a run.
+
+    All processes must call it.
+
+    Raises:
+        PersistError: in every process, when it cannot be made.
+    """
+    kind, chosen = load_plugin("backbone", name), make_settings("backbone", name, settings)
+    outcome = [chosen, ""]
+    if PartialState().is_main_process:
+        steps = step_folders(run)
+        try:
+            outcome[0] = kind.compute_once(chosen, run, steps[-1] / "model" if steps else None)
+        except PersistError as error:
+            outcome[1] = str(error)  # for the others too, which would wait
+    broadcast_object_list(outcome)
+    if outcome[1]:
+        raise PersistError(outcome[1])
+    backbone: Backbone = kind(outcome[0])
+    return backbone
 
 
 def known_hashes(run: Path) -> dict[str, str]:

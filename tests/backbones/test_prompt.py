@@ -8,6 +8,7 @@ from diffusers import CogVideoXPipeline
 from transformers import T5EncoderModel, T5Tokenizer
 
 from persist_backbones import write_prompt
+from persist_cli.api.checkpoint import step_folders
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import read_tensors, write_tensors
 from persist_cli.plugins import make_backbone
@@ -46,6 +47,35 @@ def test_pretrained_weights_get_the_embedding_of_the_empty_prompt_unless_zeros_a
     alone = shutil.copytree(folder, tmp_path / "alone", ignore=shutil.ignore_patterns("text_encoder"))
     with pytest.raises(CheckpointError, match=r"no text_encoder/ to embed the prompt '' with; give .*prompt=null for"):
         make_backbone("cogvideox", {"pretrained": str(alone)} | size)
+
+
+def test_a_processor_that_is_slow_in_half_precision_embeds_in_float32(folder, tmp_path, monkeypatch):
+    exact = load_twin(folder, prompt=PROMPT).prompt
+    half = shutil.copytree(folder, tmp_path / "half")
+    T5EncoderModel.from_pretrained(half / "text_encoder", dtype=torch.bfloat16).save_pretrained(half / "text_encoder")
+    errors = {}
+    for slow in (False, True):
+        monkeypatch.setattr("persist_backbones.cogvideox.prompt.is_slow", lambda dtype, slow=slow: slow)
+        prompt = load_twin(half, prompt=PROMPT).prompt
+        errors[slow] = float((prompt - exact).abs().max())
+        assert torch.equal(prompt, prompt.bfloat16().float()) is not slow
+    assert errors[True] < errors[False]
+
+
+def test_a_run_goes_on_with_the_prompt_of_its_checkpoint(folder, walks, persist, tmp_path):
+    twin, run = shutil.copytree(folder, tmp_path / "twin"), tmp_path / "run"
+    changes = [f"backbone.settings.pretrained={twin}", "backbone.settings.height=32", "backbone.settings.width=32"]
+    changes += ["training.steps=1", "training.batch=1", "training.accumulation=1", "training.precision=no"]
+    command = ["finetune", "cogvideox-2b-stage1", "--data", walks, "--out", run, "training.workers=0", *changes]
+    ended = persist(*command)
+    assert ended.code == 0, ended.err
+    shutil.rmtree(twin / "text_encoder")
+    (run / "prompt.safetensors").unlink()
+    ended = persist(*command, "--resume", "training.steps=2")
+    assert ended.code == 0, ended.err
+    first, last = (read_tensors(step / "model" / "world.safetensors")[0]["prompt"] for step in step_folders(run))
+    assert torch.equal(first, last)
+    assert torch.equal(first, load_twin(folder, prompt="").prompt)
 
 
 def test_a_model_that_starts_from_no_weights_knows_no_text_and_has_zeros():

@@ -15,12 +15,15 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from accelerate import PartialState
 
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.checkpoints.load import load_backbone
+from persist_cli.errors import PersistError
 from persist_cli.io.files import read_tensors
 from persist_cli.recipe import make_recipe, read_recipe
 from persist_cli.train.distributed import Sharding, fsdp_plugin
+from persist_cli.train.sources import make_run_backbone
 from persist_cli.train.state import read_shards
 from tests.support.damage import without_sums
 from tests.support.micro_model import micro, with_adapter
@@ -34,7 +37,9 @@ from tests.support.micro_runs import (
     stage,
     two_process_launch,
 )
-from tests.support.processes import run_command, start_pair, wait_until
+from tests.support.processes import run_command, run_in_pair, start_pair, wait_until
+from tests.support.text_encoder import write_text_encoder
+from tests.support.twins import load_twin, write_twin
 from tests.support.two_processes import job, run_in_two
 from tests.train.test_clip_cache import FEW, share_cached
 from tests.train.test_own_writes import OWN
@@ -394,3 +399,28 @@ def test_ctrl_c_saves_on_all(start, resume):
     _, output = run.end()
     assert output.count("go on with --resume") == 1, output
     resume()
+
+
+def make_in_pair(homes: list[Path], run: Path) -> None:
+    """Make a run's backbone of this process's own twins, and write its prompt or why there is none into its home."""
+    home = homes[PartialState(cpu=True).process_index]
+    os.chdir(home)
+    for twin in ("twin", "without"):
+        settings = {"pretrained": twin, "frames": 17, "height": 32, "width": 48, "prompt": "a walk"}
+        try:
+            outcome = str(make_run_backbone(run, "cogvideox", settings).prompt)
+        except PersistError as error:
+            outcome = str(error)
+        (home / f"{twin}.txt").write_text(outcome)
+
+
+def test_the_main_process_alone_embeds_the_prompt(tmp_path):
+    homes = [tmp_path / "main", tmp_path / "other"]
+    whole = write_text_encoder(write_twin("2b", homes[0] / "twin"))
+    for twin in (homes[0] / "without", homes[1] / "twin", homes[1] / "without"):
+        shutil.copytree(whole, twin, ignore=shutil.ignore_patterns("text_encoder"))
+    assert run_in_pair(make_in_pair, homes, tmp_path, output=tmp_path) == [0, 0]
+    made, refused = ([(home / f"{twin}.txt").read_text() for home in homes] for twin in ("twin", "without"))
+    assert made == 2 * [str(load_twin(whole, prompt="a walk").prompt)]
+    assert refused[0] == refused[1]
+    assert "no text_encoder/ to embed the prompt" in refused[0]

@@ -52,6 +52,7 @@ from persist_backbones.cogvideox.inputs import (
 from persist_backbones.cogvideox.model import NO_MEMORY, Conditions, widen
 from persist_backbones.cogvideox.parameter_groups import group_parameters, truncate_layers
 from persist_backbones.cogvideox.parts import (
+    WORLD,
     DiffusersParts,
     load_part,
     load_parts,
@@ -84,7 +85,7 @@ class CogVideoX(AdaptedBackbone):
     never_sharded = ("codec",)
     built_by = ("transformer", "prediction", "vae", "pretrained")
     of_weights = ("rotary_grid",)
-    video_model = ("transformer", "world.safetensors")
+    video_model = ("transformer", WORLD)
     for_training = LOSS_SETTINGS
     settings: CogVideoXSettings
     prompt: Tensor

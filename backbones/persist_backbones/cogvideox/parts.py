@@ -40,6 +40,7 @@ SUBFOLDERS = {
     "scheduler": CogVideoXDDIMScheduler,
 }
 WEIGHTS = "diffusion_pytorch_model.safetensors"  # the weights of a part in a single file
+WORLD = "world.safetensors"  # of a trained model: all that diffusers' parts do not have
 REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 PUBLISHERS = ("zai-org", "THUDM")  # of the same repositories, now and before
 PUBLISHED = {  # preset of each of their repositories
@@ -188,12 +189,12 @@ def save_parts(parts: DiffusersParts, folder: Path) -> None:
 def save_world(transformer: nn.Module, prompt: Tensor, folder: Path) -> None:
     """Write ``world.safetensors``: widening, interactions and the prompt's embedding."""
     widening = {name: value for name, value in transformer.state_dict().items() if not name.startswith("base.")}
-    write_tensors(folder / "world.safetensors", widening | {"prompt": prompt})
+    write_tensors(folder / WORLD, widening | {"prompt": prompt})
 
 
 def load_world(transformer: nn.Module, folder: Path) -> Tensor:
     """Load what ``save_world`` wrote, and return the prompt's embedding in the transformer's precision."""
-    path = folder / "world.safetensors"
+    path = folder / WORLD
     tensors, _ = read_tensors(path)
     prompt = tensors.pop("prompt", None)
     if prompt is None:

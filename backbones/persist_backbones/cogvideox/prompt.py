@@ -5,6 +5,7 @@ A world model has one constant prompt. Its embedding is stored with the checkpoi
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import torch
@@ -12,9 +13,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from persist_backbones.cogvideox.config import CogVideoXSettings
-from persist_backbones.cogvideox.parts import pretrained_folder
+from persist_backbones.cogvideox.parts import WORLD, load_part, pretrained_folder
+from persist_cli.api.half_precision import is_slow
+from persist_cli.api.meta_device import without_weights
 from persist_cli.errors import CheckpointError
-from persist_cli.io.files import read_json, read_tensors, reallocate, write_tensors
+from persist_cli.io.files import read_tensors, reallocate, write_tensors
 from persist_cli.io.hub import without_bars
 
 ORIGINS = ("pretrained", "prompt", "prompt_embedding")  # settings that a checkpoint replaces by weights
@@ -67,10 +70,31 @@ def read_prompt(path: Path) -> Float[Tensor, "1 word channel"]:
     return tensors[NAME]
 
 
+def with_prompt_embedding(settings: CogVideoXSettings, folder: Path, begun: Path | None) -> CogVideoXSettings:
+    """Return settings with the file of an embedding in the place of a prompt that T5 would embed.
+
+    Args:
+        settings: settings with a prompt, an embedding's file, or neither.
+        folder: the folder that ``prompt.safetensors`` is written into.
+        begun: the folder of a trained model, whose own prompt is taken; ``None`` asks T5.
+
+    Raises:
+        CheckpointError: as ``starting_prompt`` does.
+    """
+    check_choice(settings)
+    if settings.pretrained is None or settings.prompt is None or settings.prompt_embedding is not None:
+        return settings
+    path = folder / "prompt.safetensors" if begun is None else begun / WORLD
+    if begun is None:
+        save_prompt(settings.prompt, settings.pretrained, path)
+    return dataclasses.replace(settings, prompt=None, prompt_embedding=str(path))
+
+
 def save_prompt(prompt: str, pretrained: str, path: Path) -> None:
     """Write a prompt's embedding into a safetensors file; see ``persist_backbones.write_prompt``."""
     folder = pretrained_folder(pretrained)
-    words = read_json(folder / "transformer" / "config.json")["max_text_seq_length"]
+    with without_weights():
+        words = load_part(folder, "transformer").config.max_text_seq_length
     write_tensors(path, {NAME: embed_prompt(prompt, folder, words)})
 
 
@@ -101,6 +125,8 @@ def embed_prompt(prompt: str, folder: Path, words: int) -> Float[Tensor, "1 word
     except (OSError, ValueError, RuntimeError, KeyError, TypeError, ImportError) as error:
         cause = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise CheckpointError(f"{folder}: the text encoder cannot be loaded ({cause}); {OTHERWISE}") from error
+    if is_slow(encoder.dtype):
+        encoder.float()
     reallocate(encoder)
     tokens = tokenizer(prompt, padding="max_length", max_length=words, return_tensors="pt").input_ids
     if tokens.shape[1] > words:

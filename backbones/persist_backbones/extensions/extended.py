@@ -15,6 +15,7 @@ from persist_backbones.cogvideox.diffusion import DrawTimesteps, SamplingStep
 from persist_backbones.cogvideox.model import Conditions, WorldTransformer
 from persist_backbones.cogvideox.parameter_groups import DISCRIMINATOR
 from persist_backbones.cogvideox.parts import DiffusersParts, save_world
+from persist_backbones.cogvideox.prompt import with_prompt_embedding
 from persist_backbones.extensions.adversarial import Discriminator, adversarial_loss, make_discriminator
 from persist_backbones.extensions.autoguidance import Autoguidance, Guide, autoguidance_of, load_guide
 from persist_backbones.extensions.distillation import (
@@ -59,6 +60,11 @@ class ExtendedCogVideoX(CogVideoX):
         """Build the model from diffusers' parts, which may be offloaded."""
         super().set_parts(parts)
         bring_when_run(self.transformer)
+
+    @classmethod
+    def compute_once(cls, settings: CogVideoXSettings, folder: Path, begun: Path | None) -> CogVideoXSettings:
+        """Return settings with the file of the prompt's embedding: T5 is large, and its results differ by machine."""
+        return with_prompt_embedding(settings, folder, begun)
 
     def forward(self, clips: Clips, stage: Stage) -> dict[str, Tensor]:
         """Return the training loss: of distillation or adversarial training, else that of ``CogVideoX``."""
