@@ -195,10 +195,10 @@ class Backbone(nn.Module, ABC):
         return False
 
     @classmethod
-    def compute_once(cls, settings: Any, folder: Path, begun: Path | None) -> Any:
-        """Return settings that name files with what takes long to compute of the given ones; by default these.
+    def compute_once(cls, settings: Any, folder: Path, begun: Path | None) -> dict[str, Any]:
+        """Compute what takes long, into files, and return the plain settings that name them; by default nothing.
 
-        The main process of a training calls it, before every process makes its backbone of the result.
+        The main process of a training calls it; then every process makes its backbone with what is returned.
 
         Args:
             settings: an instance of ``settings_type``.
@@ -208,7 +208,7 @@ class Backbone(nn.Module, ABC):
         Raises:
             PersistError: one line when it cannot be computed.
         """
-        return settings
+        return {}
 
     def begin_stage(self, stage: Stage, clips: Iterable[Clips]) -> None:
         """Begin a stage that has no base by setting fresh weights from some clips; nothing by default."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +20,6 @@ from persist_cli.io.settings import parse_settings
 from persist_cli.output.console import warn
 from persist_cli.plugins import load_plugin, make_backbone
 from persist_cli.recipe import BackboneConfig, MemoryConfig, Recipe, recipe_values
-
-MakeBackbone = Callable[[str, dict[str, Any]], Backbone]  # of a name and plain settings
 
 
 def load_backbone(
@@ -188,7 +186,7 @@ def named_adapter(text: str) -> tuple[Checkpoint, str]:
     return checkpoint, chosen
 
 
-def start_backbone(recipe: Recipe, base: Checkpoint | None, make: MakeBackbone = make_backbone) -> Backbone:
+def start_backbone(recipe: Recipe, base: Checkpoint | None) -> Backbone:
     """The backbone that a training begins with: a fresh one, or that of the base with the recipe's settings on top.
 
     On a base that is a codec alone, stage 1 trains a fresh video model of the recipe's settings and seed.
@@ -196,7 +194,6 @@ def start_backbone(recipe: Recipe, base: Checkpoint | None, make: MakeBackbone =
     Args:
         recipe: the recipe.
         base: the checkpoint that the training starts from.
-        make: makes a fresh backbone of a name and plain settings.
 
     Raises:
         RecipeError: when the base is of another backbone than the recipe's, or was built by other settings.
@@ -204,13 +201,13 @@ def start_backbone(recipe: Recipe, base: Checkpoint | None, make: MakeBackbone =
     """
     config = recipe.backbone
     if base is None:
-        return make(config.name, config.settings)
+        return make_backbone(config.name, config.settings)
     if base.backbone != config.name:
         raise RecipeError(f"base {base.folder} is of backbone {base.backbone!r}, not {config.name!r}")
     if recipe.memory is not None or recipe.lora is not None:
         check_video_model(base)
     if recipe.stage == "1" and is_codec_alone(base):
-        return fresh_on_codec(base, config.settings, make)
+        return fresh_on_codec(base, config.settings)
     built_by = load_plugin("backbone", config.name).built_by
     changed = changed_settings(base.settings, {key: config.settings[key] for key in built_by if key in config.settings})
     if not changed:
@@ -225,7 +222,7 @@ def start_backbone(recipe: Recipe, base: Checkpoint | None, make: MakeBackbone =
         raise RecipeError(
             f"backbone.settings.{changed[0]}: base {base.folder} is a model that was built with another; leave it out"
         )
-    return fresh_on_codec(base, config.settings, make)
+    return fresh_on_codec(base, config.settings)
 
 
 def check_frozen(config: BackboneConfig, base: Checkpoint) -> None:
@@ -251,12 +248,12 @@ def takes_codec_alone(checkpoint: Checkpoint) -> bool:
     return load_plugin("backbone", checkpoint.backbone).load_codec is not Backbone.load_codec
 
 
-def fresh_on_codec(checkpoint: Checkpoint, settings: Mapping[str, Any], make: MakeBackbone = make_backbone) -> Backbone:
+def fresh_on_codec(checkpoint: Checkpoint, settings: Mapping[str, Any]) -> Backbone:
     """A backbone with fresh weights on the codec of a checkpoint; the settings replace those of the checkpoint."""
     checkpoint.check_weights(None)
     of_weights = load_plugin("backbone", checkpoint.backbone).of_weights
     own = {name: value for name, value in checkpoint.settings.items() if name not in of_weights}
-    backbone = make(checkpoint.backbone, merge_settings(own, settings))
+    backbone = make_backbone(checkpoint.backbone, merge_settings(own, settings))
     backbone.load_codec(checkpoint.base_folder)
     return backbone
 

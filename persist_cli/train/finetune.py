@@ -36,8 +36,8 @@ from persist_cli.api.scene_model import SceneModel
 from persist_cli.api.stages import SCENE_STAGES
 from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.checkpoints.load import (
-    MakeBackbone,
     add_adapter,
+    is_codec_alone,
     is_distilled,
     start_backbone,
     starts_from_random_codec,
@@ -54,7 +54,7 @@ from persist_cli.io.files import check_folder
 from persist_cli.io.signals import repeated_signals
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.output.console import busy, say, warn
-from persist_cli.plugins import make_backbone, make_scene_model
+from persist_cli.plugins import make_scene_model
 from persist_cli.policies.trained import find_policy, make_network
 from persist_cli.recipe import (
     Recipe,
@@ -86,7 +86,7 @@ from persist_cli.train.sources import (
     known_hashes,
     knows_other_data,
     knows_scene_model,
-    make_run_backbone,
+    with_computed_settings,
     with_own_adapter,
 )
 from persist_cli.train.state import load_state
@@ -226,8 +226,10 @@ def prepare_trainer(
     if recipe.scene is not None:
         return SceneTrainer(recipe, *prepare_scene_model(recipe, run), accelerator, plan.cache)
     factory = MemoryFactory.of(recipe.memory, accelerator.device) if recipe.memory else None
-    make = partial(make_run_backbone, run)
-    backbone = prepare_backbone(with_own_adapter(recipe, run), base, factory, make)
+    begun_with = with_own_adapter(recipe, run)
+    if base is None or is_codec_alone(base):
+        begun_with = with_computed_settings(begun_with, run)
+    backbone = prepare_backbone(begun_with, base, factory)
     if accelerator.is_main_process and starts_from_random_codec(recipe, backbone):
         warn(f"{run}: {RANDOM_CODEC}")
     if accelerator.is_main_process and base and factory and recipe.distill is None and is_distilled(base):
@@ -344,17 +346,13 @@ def make_accelerator(recipe: Recipe, run: Path) -> Accelerator:
     return accelerator
 
 
-def prepare_backbone(
-    recipe: Recipe, base: Checkpoint | None, factory: MemoryFactory | None, make: MakeBackbone = make_backbone
-) -> Backbone:
+def prepare_backbone(recipe: Recipe, base: Checkpoint | None, factory: MemoryFactory | None) -> Backbone:
     """The backbone to train: fresh or that of the base, with a fresh LoRA or memory adapter where the recipe has one.
-
-    Arguments are those of ``start_backbone``, and the maker of the memories that an adapter reads.
 
     Raises:
         RecipeError: when LoRA has no weights to change.
     """
-    backbone = start_backbone(recipe, base, make)
+    backbone = start_backbone(recipe, base)
     if recipe.lora is not None:
         if base is None and not backbone.origin():
             raise RecipeError("lora changes weights that are there; give base=RUN, or pretrained backbone.settings")

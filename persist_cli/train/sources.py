@@ -18,7 +18,6 @@ from typing import Any, Final
 from accelerate import PartialState
 from accelerate.utils import broadcast_object_list
 
-from persist_cli.api.backbone import Backbone
 from persist_cli.api.checkpoint import (
     SHOWN,
     STEP,
@@ -67,27 +66,28 @@ def with_own_adapter(recipe: Recipe, run: Path) -> Recipe:
     return replace(recipe, adapter_from=str(run))
 
 
-def make_run_backbone(run: Path, name: str, settings: dict[str, Any]) -> Backbone:
-    """Make the fresh backbone of a run; what takes long for it is computed by the main process, once in a run.
+def with_computed_settings(recipe: Recipe, run: Path) -> Recipe:
+    """The recipe with settings of its backbone that take long to compute, which the main process does once in a run.
 
     All processes must call it.
 
     Raises:
-        PersistError: in every process, when it cannot be made.
+        PersistError: in every process, when something cannot be computed.
     """
-    kind, chosen = load_plugin("backbone", name), make_settings("backbone", name, settings)
-    outcome = [chosen, ""]
+    name, given = recipe.backbone.name, recipe.backbone.settings
+    settings = make_settings("backbone", name, given)
+    outcome: list[Any] = [{}, ""]  # settings, or why there are none
     if PartialState().is_main_process:
         steps = step_folders(run)
         try:
-            outcome[0] = kind.compute_once(chosen, run, steps[-1] / "model" if steps else None)
+            begun = steps[-1] / "model" if steps else None
+            outcome[0] = load_plugin("backbone", name).compute_once(settings, run, begun)
         except PersistError as error:
             outcome[1] = str(error)  # for the others too, which would wait
     broadcast_object_list(outcome)
     if outcome[1]:
         raise PersistError(outcome[1])
-    backbone: Backbone = kind(outcome[0])
-    return backbone
+    return replace(recipe, backbone=replace(recipe.backbone, settings={**given, **outcome[0]}))
 
 
 def known_hashes(run: Path) -> dict[str, str]:

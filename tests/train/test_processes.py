@@ -18,12 +18,12 @@ import torch
 from accelerate import PartialState
 
 from persist_cli.api.checkpoint import find_checkpoint
-from persist_cli.checkpoints.load import load_backbone
+from persist_cli.checkpoints.load import load_backbone, start_backbone
 from persist_cli.errors import PersistError
 from persist_cli.io.files import read_tensors
 from persist_cli.recipe import make_recipe, read_recipe
 from persist_cli.train.distributed import Sharding, fsdp_plugin
-from persist_cli.train.sources import make_run_backbone
+from persist_cli.train.sources import with_computed_settings
 from persist_cli.train.state import read_shards
 from tests.support.damage import without_sums
 from tests.support.micro_model import micro, with_adapter
@@ -407,8 +407,9 @@ def make_in_pair(homes: list[Path], run: Path) -> None:
     os.chdir(home)
     for twin in ("twin", "without"):
         settings = {"pretrained": twin, "frames": 17, "height": 32, "width": 48, "prompt": "a walk"}
+        recipe = make_recipe({"stage": "1", "backbone": {"name": "cogvideox", "settings": settings}}, "mine")
         try:
-            outcome = str(make_run_backbone(run, "cogvideox", settings).prompt)
+            outcome = str(start_backbone(with_computed_settings(recipe, run), None).prompt)
         except PersistError as error:
             outcome = str(error)
         (home / f"{twin}.txt").write_text(outcome)

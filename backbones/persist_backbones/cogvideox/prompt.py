@@ -5,8 +5,8 @@ A world model has one constant prompt. Its embedding is stored with the checkpoi
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -70,8 +70,8 @@ def read_prompt(path: Path) -> Float[Tensor, "1 word channel"]:
     return tensors[NAME]
 
 
-def with_prompt_embedding(settings: CogVideoXSettings, folder: Path, begun: Path | None) -> CogVideoXSettings:
-    """Return settings with the file of an embedding in the place of a prompt that T5 would embed.
+def computed_prompt(settings: CogVideoXSettings, folder: Path, begun: Path | None) -> dict[str, Any]:
+    """Return settings that name the file of an embedding in the place of a prompt that T5 would embed; else none.
 
     Args:
         settings: settings with a prompt, an embedding's file, or neither.
@@ -83,11 +83,11 @@ def with_prompt_embedding(settings: CogVideoXSettings, folder: Path, begun: Path
     """
     check_choice(settings)
     if settings.pretrained is None or settings.prompt is None or settings.prompt_embedding is not None:
-        return settings
+        return {}
     path = folder / "prompt.safetensors" if begun is None else begun / WORLD
     if begun is None:
         save_prompt(settings.prompt, settings.pretrained, path)
-    return dataclasses.replace(settings, prompt=None, prompt_embedding=str(path))
+    return {"prompt": None, "prompt_embedding": str(path)}
 
 
 def save_prompt(prompt: str, pretrained: str, path: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -15,7 +15,7 @@ from persist_backbones.cogvideox.diffusion import DrawTimesteps, SamplingStep
 from persist_backbones.cogvideox.model import Conditions, WorldTransformer
 from persist_backbones.cogvideox.parameter_groups import DISCRIMINATOR
 from persist_backbones.cogvideox.parts import DiffusersParts, save_world
-from persist_backbones.cogvideox.prompt import with_prompt_embedding
+from persist_backbones.cogvideox.prompt import computed_prompt
 from persist_backbones.extensions.adversarial import Discriminator, adversarial_loss, make_discriminator
 from persist_backbones.extensions.autoguidance import Autoguidance, Guide, autoguidance_of, load_guide
 from persist_backbones.extensions.distillation import (
@@ -62,9 +62,9 @@ class ExtendedCogVideoX(CogVideoX):
         bring_when_run(self.transformer)
 
     @classmethod
-    def compute_once(cls, settings: CogVideoXSettings, folder: Path, begun: Path | None) -> CogVideoXSettings:
-        """Return settings with the file of the prompt's embedding: T5 is large, and its results differ by machine."""
-        return with_prompt_embedding(settings, folder, begun)
+    def compute_once(cls, settings: CogVideoXSettings, folder: Path, begun: Path | None) -> dict[str, Any]:
+        """Return the file of the prompt's embedding: T5 is large, and its results differ by machine."""
+        return computed_prompt(settings, folder, begun)
 
     def forward(self, clips: Clips, stage: Stage) -> dict[str, Tensor]:
         """Return the training loss: of distillation or adversarial training, else that of ``CogVideoX``."""
