@@ -37,7 +37,6 @@ from persist_cli.api.stages import SCENE_STAGES
 from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.checkpoints.load import (
     add_adapter,
-    is_codec_alone,
     is_distilled,
     start_backbone,
     starts_from_random_codec,
@@ -227,7 +226,7 @@ def prepare_trainer(
         return SceneTrainer(recipe, *prepare_scene_model(recipe, run), accelerator, plan.cache)
     factory = MemoryFactory.of(recipe.memory, accelerator.device) if recipe.memory else None
     begun_with = with_own_adapter(recipe, run)
-    if base is None or is_codec_alone(base):
+    if base is None:
         begun_with = with_computed_settings(begun_with, run)
     backbone = prepare_backbone(begun_with, base, factory)
     if accelerator.is_main_process and starts_from_random_codec(recipe, backbone):
