@@ -137,11 +137,12 @@ def missing_weights(recipe: Recipe) -> str | None:
 def preparations(plan: Plan, houses: int) -> list[str]:
     """The command lines that bring weights, and houses where the plan names none of its own."""
     explored, home = max(1, houses // 4), shlex.quote(str(plan.out))
+    first = max(1600, houses - explored)  # of the explored ones, which are others than those of the paths
     lines = [f"weights fetch {' '.join(FETCHED)}"]
     if plan.data == default_data(plan.out):
         lines += [
             f"{COLLECT} --out {home}/houses/path --scenes 0:{houses - explored} --frames 100 --policy path",
-            f"{COLLECT} --out {home}/houses/explore --scenes 1600:{1600 + explored} --frames 100 --policy explore",
+            f"{COLLECT} --out {home}/houses/explore --scenes {first}:{first + explored} --frames 100 --policy explore",
         ]
     if plan.held_out == default_held_out(plan.out):
         lines += [

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from persist_cli.api.actions import ActionVocabulary, format_actions, free_motion, walking_actions
+from persist_cli.api.actions import Action, ActionVocabulary, format_actions, free_motion, walking_actions
 from persist_cli.errors import DataError
 from tests.support.rooms import look
 
@@ -92,3 +92,15 @@ def test_a_step_or_turn_that_is_no_motion_is_refused(step, turn):
 def test_a_step_in_millimetres_is_refused():
     with pytest.raises(DataError, match="a step of 250 m; give --step in metres, 10 at most"):
         free_motion().walking(250.0)
+
+
+def test_walking_actions_keep_the_sizes_of_the_own_ones_that_are_not_given():
+    own = walking_actions(0.1, 30.0)
+    assert [own.walking(step=0.5)[name].turn for name in ("left", "right")] == [30.0, -30.0]
+    assert [own.walking(turn=5.0)[name].forward for name in ("forward", "backward")] == [0.1, -0.1]
+
+
+def test_moving_actions_walk_ahead_or_turn_on_the_spot_but_never_go_back():
+    arc, retreat = Action("arc", forward=0.2, turn=10.0), Action("retreat", forward=-0.2, turn=10.0)
+    moving = ActionVocabulary((*WALK.actions, arc, retreat)).moving
+    assert [action.name for action in moving] == ["forward", "left", "right", "arc"]

@@ -9,7 +9,19 @@ import torch
 
 from persist_cli.api.actions import rotation_about
 from persist_cli.api.cameras import Cameras, check_intrinsics, check_poses, invert_rigid
-from persist_cli.api.geometry import near_poses, nearest_at, pixel_centers, plucker, project, transform, unproject
+from persist_cli.api.geometry import (
+    find_in_views,
+    in_view,
+    near_poses,
+    nearest_at,
+    pixel_centers,
+    plucker,
+    pose_differences,
+    project,
+    small_motions,
+    transform,
+    unproject,
+)
 from persist_cli.errors import DataError
 
 K = torch.tensor([[40.0, 0.0, 33.0], [0.0, 42.0, 20.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -106,3 +118,55 @@ def test_poses_are_near_only_if_both_distance_and_angle_are_small():
     assert near_poses(poses[:1], poses).tolist() == [[True, True, False, False]]
     assert near_poses(poses[:1], poses, degrees=15.0).tolist() == [[True, True, False, True]]
     assert not near_poses(poses, poses, metres=0.0).any()
+
+
+def test_a_view_sees_the_points_on_its_surfaces_alone():
+    camera = Cameras(torch.eye(4, dtype=torch.float64)[None], K[None], 40, 64)
+    depth = torch.full((1, 40, 64), 2.0)
+    depth[:, :, :10] = 0  # missing
+    on, before, behind, gap = ([(column - 33) / 40 * z, 0.0, z] for column, z in ((40, 2), (40, 1), (40, 3), (5, 2)))
+    aside, back = [4.0, 0.0, 2.0], [0.0, 0.0, -2.0]
+    points = torch.tensor([[on, before, behind, gap, aside, back]], dtype=torch.float64)
+    assert find_in_views(points, depth, camera)[1].tolist() == [[True, False, False, False, False, False]]
+
+
+def test_only_points_deeper_than_the_near_plane_are_in_view():
+    camera = cameras(1)[0]
+    rays = torch.tensor([[0.0, 0.0, 0.05], [0.0, 0.0, 0.2], [0.0, 0.0, -1.0]], dtype=torch.float64)
+    points = transform(camera.world_from_camera, rays)
+    assert in_view(points, camera)[0].tolist() == [True, True, False]
+    assert in_view(points, camera, near=0.1)[0].tolist() == [False, True, False]
+
+
+def test_poses_differ_by_what_one_camera_sees_of_the_other_wherever_both_are():
+    first, turn = rigid(1), torch.eye(4, dtype=torch.float64)
+    turn[:3, :3] = rotation_about(torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64), math.radians(70))
+    turn[:3, 3] = torch.tensor([3.0, 0.0, 4.0])
+    metres, degrees = pose_differences(first, first @ turn)
+    assert (float(metres), float(degrees)) == pytest.approx((5, 70))
+
+
+def test_a_small_motion_turns_about_its_axis_as_the_right_hand_does_and_then_moves():
+    axis = torch.tensor([2.0, -1.0, 2.0], dtype=torch.float64) / 3
+    metres = torch.tensor([[1.0, 2.0, 3.0]], dtype=torch.float64)
+    motion = small_motions(metres, 0.4 * axis[None])[0]
+    assert torch.allclose(motion[:3, :3], rotation_about(axis, 0.4))
+    assert torch.equal(motion[:3, 3], metres[0])
+
+
+def test_a_cropped_camera_sees_the_same_points_at_pixels_of_its_window():
+    views = cameras(1)
+    points = unproject(torch.full((1, 40, 64), 2.0), views).flatten(1, 2)
+    window = views.cropped(top=3, left=10, height=20, width=30)
+    pixels, full = project(points, window)[0], project(points, views)[0]
+    assert (window.height, window.width) == (20, 30)
+    assert torch.allclose(pixels, full - torch.tensor([10.0, 3.0], dtype=torch.float64))
+
+
+def test_cameras_relative_to_one_of_them_see_what_they_saw_from_there():
+    views, points = cameras(), torch.randn(3, 7, 3, dtype=torch.float64)
+    reference = views.world_from_camera[1]
+    moved = transform(invert_rigid(reference)[None], points.reshape(1, -1, 3)).reshape(3, 7, 3)
+    assert torch.allclose(views.relative_to(reference).world_from_camera[1], torch.eye(4, dtype=torch.float64))
+    there, here = project(moved, views.relative_to(reference))[1], project(points, views)[1]
+    assert torch.allclose(there, here)

@@ -48,6 +48,12 @@ def test_depth_is_never_mixed_across_an_edge(size: tuple[int, int]) -> None:
     assert set(np.unique(resized)) == {1.0, 5.0}
 
 
+def test_resized_depth_is_that_of_the_pixel_in_the_middle_as_colours_are() -> None:
+    depth = np.arange(9 * 15, dtype=np.float32).reshape(9, 15)
+    assert np.array_equal(crop_resize((9, 15), (3, 5)).depth(depth), depth[1::3, 1::3])
+    assert np.array_equal(crop_resize((9, 15), (3, 3)).depth(depth), depth[1::3, 4:12:3])
+
+
 @pytest.mark.parametrize("size", SIZES)
 def test_the_window_is_central_and_has_the_aspect_of_the_target(size: tuple[int, int]) -> None:
     crop = crop_resize((48, 64), size)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from persist_cli.api.policy import Goal
-from persist_cli.environments.task import Attempt, TaskSettings, View, moving_actions
+from persist_cli.environments.task import FARTHEST, Attempt, TaskSettings, View, moving_actions
 from persist_cli.errors import DataError
 from persist_cli.io.settings import parse_settings
 from tests.support.rooms import UP, Room, look
@@ -76,6 +76,21 @@ def test_a_goal_that_is_a_place_is_told_from_where_the_agent_is():
     there[:3, 3] = ahead(4.0)
     episode.advance([View(BLACK, np.zeros((4, 4), np.float32), there, 1.0)])
     assert episode.observation()["goal"] == pytest.approx([-1.0, 0.0], abs=1e-6)
+
+
+def test_depth_is_observed_up_to_its_farthest_and_lies_in_its_space():
+    depth = np.array([[0.0, 3.0], [FARTHEST, 3 * FARTHEST]], np.float32)
+    start = View(BLACK[:2, :2], depth, look((0.0, 1.3, 0.0), 0.0, 0.0), 3.0)
+    goal = Goal(torch.zeros(2, 2, 3, dtype=torch.uint8), torch.zeros(3), "room")
+    seen = Attempt(start, goal, UP, TaskSettings()).observation()
+    assert seen["depth"].tolist() == [[0.0, 3.0], [FARTHEST, FARTHEST]]
+    assert seen["depth"].dtype == np.float32
+
+
+def test_the_first_distance_of_an_episode_is_that_of_its_start():
+    episode = attempt()
+    episode.advance([view(0, 0.5, 0, 2.5), view(0, 1.0, 0, 2.0)])
+    assert (episode.info()["first_distance"], episode.info()["distance"]) == (3.0, 2.0)
 
 
 def test_a_goal_without_an_image_is_not_shown_as_a_black_one():

@@ -130,3 +130,62 @@ def test_a_row_of_cem_plans_with_what_was_set_and_keeps_nothing_where_that_is_sa
     wanted = CemSettings(horizon=5, candidates=7, rounds=2, kept=0.3, smoothing=0.0, shift=0.5)
     assert make_planner(row, None, plans, 5).settings == wanted
     assert make_planner(row, None, replace(plans, keep=False), 5).settings == replace(wanted, shift=0.0)
+
+
+class StopsAt:
+    """The rule of an agent that recognises its goal in views of some numbers, counted from 0."""
+
+    def __init__(self, *numbers: int) -> None:
+        self.numbers, self.seen = numbers, -1
+
+    def stops(self, view: object, goal: object, world_up: object) -> bool:
+        """Return whether the next view is one of them."""
+        self.seen += 1
+        return self.seen in self.numbers
+
+
+class Proposes(type(make_policy("random", {}))):  # type: ignore[misc]
+    """A policy that always proposes the same."""
+
+    way: tuple[str, ...] = ()
+
+    def propose(self, situation: object, horizon: int, count: int, generator: object) -> list[tuple[str, ...]]:
+        """Return it as often as asked for."""
+        return [self.way[:horizon]] * count
+
+
+def run_alone(scene: TrueScene, rule: StopsAt, way: tuple[str, ...], **settings: int) -> dict[str, Any]:
+    """Run an agent that always proposes a way, and follows it without imagining."""
+    scene.back_to_start()
+    policy = Proposes(make_policy("random", {}).settings)
+    policy.way = way
+    navigator = Navigator(ALONE, RowParts(policy, COST), PlanSettings(), scene, 8)
+    return run_closed_loop(scene, navigator, rule, LoopSettings(**settings))
+
+
+def test_who_proposes_nothing_has_stopped_by_himself(scene: TrueScene) -> None:
+    record = run_alone(scene, StopsAt(), ())
+    assert (record["ended"], record["actions"]) == ("gave no action", "")
+    assert (record["figures"]["wrong_stop"], record["figures"]["actions"]) == (1, 0)
+
+
+def test_a_goal_that_is_recognised_after_the_last_action_is_a_stop_and_one_never_seen_is_none(scene: TrueScene) -> None:
+    way = ("left", "right", "left", "left")
+    last = run_alone(scene, StopsAt(3), way, max_actions=3)
+    assert (last["ended"], last["actions"]) == ("stopped", "left right left")
+    out = run_alone(scene, StopsAt(), way, max_actions=3)
+    assert (out["ended"], out["figures"]["wrong_stop"], out["figures"]["actions"]) == ("out of actions", 0, 3)
+
+
+def test_an_agent_stops_at_the_first_view_of_its_goal_and_not_at_the_end_of_its_plan(scene: TrueScene) -> None:
+    record = run_alone(scene, StopsAt(2), ("left",) * 8, execute=8)
+    assert (record["ended"], record["actions"], record["figures"]["decisions"]) == ("stopped", "left*2", 1)
+
+
+def test_the_metres_left_are_measured_anew_after_every_action(scene: TrueScene) -> None:
+    way = scene.info.vocabulary.parse(scene.episode.actions)
+    record = run_alone(scene, StopsAt(len(way)), way, execute=len(way))
+    assert record["figures"]["end_metres"] == pytest.approx(0, abs=1e-6)
+    assert record["figures"]["start_metres"] > 1
+    assert (record["figures"]["success"], record["figures"]["spl"]) == (1, pytest.approx(1))
+    assert record["refused"] == []

@@ -12,12 +12,14 @@ from typing import Any
 import pytest
 import torch
 
+from persist_cli.api.observations import Observations
 from persist_cli.episodes.episodes import SIGHT_SHARE, Episode, EpisodeSet, read_episodes
 from persist_cli.episodes.find_episodes import NEAREST_GOAL, find_episodes
 from persist_cli.episodes.navigation_metrics import SUCCESS_METRES
 from persist_cli.episodes.shortest_actions import ShortestActions
 from persist_cli.episodes.true_scene import TrueScene
 from persist_cli.errors import DataError
+from persist_cli.evaluate.coverage import seen_share
 from persist_cli.simulators.free_grid import Geodesic
 from persist_cli.simulators.miniworld import MiniWorld
 from persist_cli.simulators.way_back import Pose
@@ -72,6 +74,30 @@ def test_the_given_walk_shows_the_goal_and_ends_at_the_start(small_world: MiniWo
         assert torch.equal(walk.rgb[0], scene.goal_view.rgb[0])
         assert episode.walk.goal_seen > 0.9
         assert Geodesic(small_world, episode.start.ground).metres(episode.goal.ground) <= episode.metres + 1e-6
+
+
+def test_an_episode_says_truly_how_much_of_its_goal_is_in_sight(small_world: MiniWorld, found: list[Episode]) -> None:
+    for episode in found:
+        scene = TrueScene(small_world, episode)
+        share = seen_share(Observations.concatenate([scene.look(), scene.goal_view]), 1, [0]) or 0.0
+        assert episode.goal_share == pytest.approx(share, abs=1e-4)
+        assert episode.in_sight or share < SIGHT_SHARE
+    assert len({episode.seed for episode in found}) == len(found)
+
+
+def test_the_given_walk_looks_all_around_and_ends_near_the_start(small_world: MiniWorld, found: list[Episode]) -> None:
+    for episode in found:
+        scene = TrueScene(small_world, episode)
+        small_world.place(episode.walk.start.ground, episode.walk.start.heading)
+        actions = scene.info.vocabulary.parse(episode.walk.actions)
+        scene.follow(actions)
+        assert Geodesic(small_world, episode.start.ground).metres(small_world.agent[0]) <= NEAREST_GOAL
+        assert actions[:24] == ("left",) * 24
+
+
+def test_no_more_episodes_of_a_kind_are_drawn_than_asked_for(small_world: MiniWorld) -> None:
+    search = replace(SEARCH, bins=(8,), each=1, per_scene=2, goals="in-sight")
+    assert [len(episodes) for episodes in find_episodes(small_world, [HOUSE, HOUSE], search)] == [1]
 
 
 def test_no_frame_from_near_the_goal_is_given_where_a_gap_is_asked_for_but_what_it_shows_is(

@@ -34,6 +34,11 @@ def test_an_action_that_does_both_is_taken_where_there_is_one():
     assert held_actions({"forward", "right"}, both) == ("forward", "right")
 
 
+def test_steps_come_before_turns_whatever_they_are_called():
+    named = ActionVocabulary((Action("aside", turn=15.0), Action("walk", forward=0.25)))
+    assert held_actions({"aside", "walk"}, named) == ("walk", "aside")
+
+
 def test_an_unknown_action_is_named():
     with pytest.raises(DataError, match="unknown action 'jump'"):
         held_actions({"jump"}, WALK)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shlex
 from pathlib import Path
 
 import pytest
@@ -26,6 +27,7 @@ from persist_cli.reproduce.ablations import (
     eval_command,
     identity,
     numbers,
+    points_of,
     preparations,
     result_folder,
     run_ablations,
@@ -202,3 +204,38 @@ def test_figures_without_a_plan_are_not_taken_for_those_of_this_one(begun):
     (plan.out / "plan.json").unlink()
     with pytest.raises(PersistError, match=r"holds results but no plan.json"):
         run_ablations(plan)
+
+
+def option(line: str, name: str) -> list[str]:
+    words = shlex.split(line)
+    return [words[place + 1] for place, word in enumerate(words) if word == name]
+
+
+@pytest.mark.parametrize("count", [40, 4000])
+def test_ablations_are_trained_on_houses_of_their_own_and_measured_on_validation_houses_alone(count):
+    collected = [line for line in preparations(PLAN, count) if line.startswith("collect")]
+    held_out = [line for line in collected if option(line, "--out")[0] in map(str, PLAN.held_out)]
+    houses = [line for line in collected if line not in held_out]
+    assert [option(line, "--out")[0] for line in houses] == [*map(str, PLAN.data)]
+    assert [option(line, "--split") for line in (*held_out, *houses)] == [["validation"]] * 2 + [[]] * 2
+    for lines in (held_out, houses):
+        (first, second) = (range(*map(int, option(line, "--scenes")[0].split(":"))) for line in lines)
+        assert not {*first} & {*second}
+    assert len(first) + len(second) == count
+    assert option(eval_command(PLAN, PREFIX, "voxel", 1000, Path("run")), "--data") == [*map(str, PLAN.held_out)]
+    assert option(train_command(PLAN, PREFIX, 63), "--data") == [*map(str, PLAN.data)]
+
+
+def test_every_training_of_a_plan_has_its_seed_steps_and_base():
+    words = shlex.split(train_command(dataclasses.replace(PLAN, seed=7, base="my base"), PREFIX, 63))
+    assert {"training.seed=7", "training.steps=63", "base=my base"} <= {*words}
+
+
+def test_a_point_keeps_the_figures_of_the_row_and_of_its_base_apart(tmp_path):
+    plan = dataclasses.replace(PLAN, out=tmp_path, recipes=(PREFIX,))
+    measured(plan, PREFIX, 1000)
+    (point,) = points_of(plan)
+    table = json.loads((result_folder(plan, PREFIX, 1000) / "metrics.json").read_text())["tables"][0]["rows"]
+    for row, kept in (("voxel", point.value), ("stage1", point.base)):
+        assert kept["psnr"] == table[row]["columns"]["psnr"]["mean"]
+    assert point.value["psnr"] != point.base["psnr"]

@@ -20,6 +20,7 @@ from persist_cli.reproduce import choose
 from persist_cli.reproduce.choose import (
     FIRST,
     RECIPE,
+    STEPS,
     TRIALS,
     Plan,
     Trial,
@@ -89,6 +90,22 @@ def test_only_validation_houses_are_measured(tmp_path: Path) -> None:
     assert data == [*map(str, asked.validation)]
 
 
+def test_houses_of_two_policies_to_choose_by_are_not_the_same(tmp_path: Path) -> None:
+    collected = [shlex.split(line) for line in preparations(plan(tmp_path)) if line.startswith("collect")]
+    scenes = [words[words.index("--scenes") + 1].split(":") for words in collected]
+    numbers = [number for low, high in scenes for number in range(int(low), int(high))]
+    assert len({*numbers}) == len(numbers) == 32
+
+
+@pytest.mark.parametrize("steps", [0, 400])
+def test_a_trial_is_trained_with_its_settings_on_the_base_and_data_of_the_plan(tmp_path: Path, steps: int) -> None:
+    asked = replace(plan(tmp_path), steps=steps)
+    for name, settings in TRIALS["voxel"].items():
+        words = shlex.split(train_command(asked, "voxel", name))
+        assert {*settings, f"base={asked.base}", f"training.steps={max(steps, 1)}"} <= {*words}
+        assert words[words.index("--data") + 1] == str(HOUSES[0])
+
+
 def test_the_lowest_cost_is_chosen_and_of_equal_ones_the_first() -> None:
     def trial(name: str, cost: float | None) -> Trial:
         return Trial(name, (), FIRST, {"lpips-alex": cost}, 8, 4)
@@ -137,6 +154,10 @@ def test_settings_are_chosen_before_sampling_and_all_is_written(measured: tuple[
     assert chosen_sampling(out) == {"snapshots": Sampling(4, "unipc", 2.0)}
     assert chosen_costs(out) == {"snapshots": pytest.approx(0.25)}
     assert len(choice["trials"]) == len(TRIALS["snapshots"]) + 2 + 4
+    tried = [(trial["name"], *trial["sampling"].values()) for trial in choice["trials"][len(TRIALS["snapshots"]) :]]
+    assert [one[:4] for one in tried] == [("64x64", 4, "unipc", 1.5), ("64x64", 4, "unipc", 2.0)] + [
+        ("64x64", steps, sampler, 2.0) for steps, sampler in STEPS
+    ]
     trained = {shlex.split(line)[shlex.split(line).index("--out") + 1] for line in lines if line.startswith("finetune")}
     assert trained == {str(out / "runs/snapshots" / name) for name in TRIALS["snapshots"]}
     assert "**64x64**" in (out / "choices.md").read_text()

@@ -23,6 +23,7 @@ from persist_cli.reproduce.learning import (
     keep_identity,
     learning_line,
     main,
+    parse,
     preparations,
     summarise,
     table,
@@ -129,3 +130,11 @@ def test_to_learn_nothing_is_refused(tmp_path: Path) -> None:
     with pytest.raises(PersistError, match="must be at least one each"):
         main([str(tmp_path), "--memories", " , "])
     assert not any(tmp_path.iterdir())
+
+
+def test_a_policy_learns_from_views_of_the_houses_in_which_it_is_measured(tmp_path: Path) -> None:
+    plan = parse([str(tmp_path), "--first", "40"])
+    episodes, views = (shlex.split(line) for line in preparations(plan) if not line.startswith("weights"))
+    assert parse_line(shlex.join(episodes))["split"] == "test"  # where nobody says another
+    assert views[views.index("--split") + 1] == "test"
+    assert [words[words.index("--scenes") + 1] for words in (episodes, views)] == ["40:52"] * 2

@@ -6,6 +6,7 @@ import json
 import re
 import shlex
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -22,6 +23,7 @@ from persist_cli.reproduce.scene_agents import (
     main,
     make_memory,
     memorize_line,
+    parse,
     practise,
     summarise,
     table,
@@ -183,3 +185,42 @@ def test_what_is_missing_is_said_before_anything_is_collected(words: list[str], 
     with pytest.raises((PersistError, CheckpointError), match=cause):
         main([str(tmp_path / "out"), *words])
     assert not (tmp_path / "out").exists()
+
+
+def test_the_image_whose_mean_depth_is_the_largest_shows_farthest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = parse([str(tmp_path)])
+    depth = torch.stack([torch.full((4, 4), metres) for metres in (1.0, 2.0, 4.0, 3.0)])
+    depth[1, 0, 0] = 20.0  # a single far pixel
+    walk = SimpleNamespace(name="house", read=lambda: SimpleNamespace(observations=SimpleNamespace(depth=depth)))
+    monkeypatch.setattr(scene_agents, "walk_of", lambda learning: walk)
+    assert images_of(Learning(plan, 400, "voxel", 0)).endswith("#house:2")
+
+
+@pytest.mark.parametrize("reason", [None, "shut in"])
+def test_a_policy_is_measured_before_and_after_by_the_same_episodes_with_which_no_learning_begins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reason: str | None
+) -> None:
+    plan = parse([str(tmp_path)])
+    measured: list[tuple[object, ...]] = []
+    learned: list[int] = []
+
+    def success_rate(policy: object, envs: object, episodes: int, seed: int) -> float:
+        measured.append((envs, episodes, seed))
+        return 0.25 * len(measured)
+
+    agent = SimpleNamespace(learn=learned.append, ep_success_buffer=[1, 0, 0, 0])
+    monkeypatch.setattr("stable_baselines3.PPO", lambda *_, **settings: agent)
+    monkeypatch.setattr("stable_baselines3.common.vec_env.VecMonitor", lambda envs: envs)
+    monkeypatch.setattr("persist_cli.environments.stable_baselines.BatchedVecEnv", lambda envs: envs)
+    monkeypatch.setattr("persist_cli.environments.stable_baselines.success_rate", success_rate)
+    monkeypatch.setattr(scene_agents, "imagined_house", lambda learning, image: "imagined")
+    monkeypatch.setattr(scene_agents, "true_house", lambda house, count: house)
+    monkeypatch.setattr(scene_agents, "missing_goal", lambda envs, seed: reason)
+    outcome = practise(Learning(plan, 401, "voxel", 1), "image")
+    assert {*measured} == {(401, 100, scene_agents.MEASURED)}
+    assert plan.seeds < scene_agents.MEASURED
+    after, practice = (0.25, None) if reason else (0.5, 0.25)
+    assert (outcome["before"], outcome["after"], outcome.get("practice")) == (0.25, after, practice)
+    assert (outcome["without_goal"], learned) == (reason, [] if reason else [plan.steps])

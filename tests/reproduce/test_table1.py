@@ -16,6 +16,7 @@ from persist_cli.io.files import write_json
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.metrics import METRICS
 from persist_cli.recipe import make_recipe, read_recipe, recipe_names
+from persist_cli.reproduce.choose import CHOICES as CHOICES_FILE
 from persist_cli.reproduce.choose import TRIALS, recipe_file
 from persist_cli.reproduce.table1 import (
     CHOSEN,
@@ -182,3 +183,13 @@ def test_memories_of_equal_information_give_as_many_colours_of_one_size() -> Non
         if recipe.adapter["form"] != "frames":
             memory = MemoryFactory.of(recipe.memory).empty(Room().info)  # type: ignore[arg-type]
             assert memory.resolution(camera) == pytest.approx(0.06, rel=0.05)
+
+
+def test_what_was_chosen_is_read_and_the_best_other_memory_is_that_of_the_lowest_cost(tmp_path: Path) -> None:
+    costs = {"none": 0.1, "voxel": 0.2, "map2d": 0.5, "views": 0.3, "context": None}
+    sampling = vars(Sampling(10, "ddim", 2.0))
+    memories = {name: {"cost": cost, "sampling": sampling} for name, cost in costs.items()}
+    write_json(tmp_path / CHOICES_FILE, {"memories": memories})
+    chosen = Chosen.of(tmp_path)
+    assert chosen.other == "views"
+    assert chosen.sampling == dict.fromkeys(costs, Sampling(10, "ddim", 2.0))

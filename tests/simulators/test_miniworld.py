@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -216,6 +217,88 @@ def test_what_stands_on_a_box_is_picked_up_before_the_box(world: MiniWorld) -> N
     top = face_a_pile(world)
     left = [thing for thing in world._things if thing.ground == top.ground]
     assert [thing.elevation for thing in left] == [0]
+
+
+def test_a_toggled_thing_has_the_complement_of_its_colour(world: MiniWorld) -> None:
+    face_a_movable_thing(world)
+    before = list(world._things)
+    assert world.act("toggle")
+    [(old, new)] = [(old, new) for old, new in zip(before, world._things, strict=True) if old != new]
+    assert [a + b for a, b in zip(old.paint.tint, new.paint.tint, strict=True)] == pytest.approx([1, 1, 1])
+
+
+def test_a_thing_behind_the_agent_or_far_ahead_is_out_of_reach(world: MiniWorld, monkeypatch) -> None:
+    face_a_movable_thing(world)
+    for _ in range(12):
+        assert world.act("left")
+    assert not world.act("toggle")
+    monkeypatch.setattr(world, "_no_wall_before", lambda ground: True)
+    thing = next(thing for thing in world._things if thing.shape == "box")
+    ((x, z), heading), reach = world.agent, 1.5 + thing.radius
+    ahead_x, ahead_z = world.ahead(heading)
+    for metres, within in ((reach - 0.05, True), (reach + 0.05, False)):
+        world._things = [replace(thing, movable=True, ground=(x + metres * ahead_x, z + metres * ahead_z))]
+        assert world.act("toggle") == within
+
+
+def alone_before_a_wall(world: MiniWorld) -> Thing:
+    """Let the agent stand before a bare wall, all things away, and return a movable box that was there."""
+    face_a_movable_thing(world)
+    box = next(thing for thing in world._things if thing.shape == "box" and thing.movable)
+    world._things = []
+    while world.act("forward"):
+        pass
+    (x, z), heading = world.agent
+    ahead_x, ahead_z = world.ahead(heading)
+    rooms = world.house.walkable(0.0)
+    assert not any(room.contains((x + 0.35 * ahead_x, z + 0.35 * ahead_z)) for room in rooms)
+    return box
+
+
+def test_nothing_is_reached_through_a_wall(world: MiniWorld) -> None:
+    box = alone_before_a_wall(world)
+    (x, z), heading = world.agent
+    ahead_x, ahead_z = world.ahead(heading)
+    world._things = [replace(box, ground=(x + 0.9 * ahead_x, z + 0.9 * ahead_z))]
+    assert not world.act("toggle")
+    assert not world.act("pick_up")
+
+
+def test_a_carried_thing_stops_the_agent_where_it_touches_a_wall_or_another_thing(world: MiniWorld) -> None:
+    box = alone_before_a_wall(world)
+    wall = world.agent[0]
+    for _ in range(6):
+        assert world.act("backward")
+    ((x, z), heading), start = world.agent, world.agent
+    ahead_x, ahead_z = world.ahead(heading)
+    world._carried, world._things = box, []
+    while world.act("forward"):
+        pass
+    stopped = math.dist(world.agent[0], wall)
+    assert box.radius + 0.3 + box.radius - 0.5 < stopped < box.radius + 0.3 + box.radius + 0.5
+    world._ground = start[0]
+    away = 0.2 + 2 * box.radius + 0.3 + 0.1  # the thing is carried at 0.2 + radius + 0.3
+    world._things = [replace(box, ground=(x + away * ahead_x, z + away * ahead_z))]
+    assert not world.act("forward")
+
+
+def test_what_is_put_down_lies_on_the_floor_before_the_agent_and_a_move_to_elsewhere_loses_nothing(
+    world: MiniWorld,
+) -> None:
+    face_a_movable_thing(world)
+    things = len(world._things)
+    assert world.act("pick_up")
+    assert world.act("drop")
+    down = world._things[-1]
+    (x, z), heading = world.agent
+    ahead_x, ahead_z = world.ahead(heading)
+    assert (down.elevation, down.heading) == (0, heading)
+    distance = 0.2 + down.radius + 0.3
+    assert down.ground == pytest.approx((x + distance * ahead_x, z + distance * ahead_z))
+    assert world.act("pick_up")
+    world.place((x, z), heading)
+    assert not world.act("drop")
+    assert len(world._things) == things
 
 
 def test_toggle_changes_a_thing_and_a_second_toggle_undoes_it(world: MiniWorld) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from persist_cli.simulators.miniworld import MiniWorld
 from persist_cli.simulators.policies import POLICIES, walk
 from persist_cli.simulators.rendering import Renderer
 from tests.support.miniworlds import make_world, put_somewhere
+from tests.support.noise import make_frames
 
 MOVES = ("forward", "backward")
 HOUSE_OF_THINGS = 9001
@@ -54,6 +56,12 @@ def test_a_walk_has_exactly_the_number_of_frames_of_its_plan(world: MiniWorld, p
         frames = collect(world, policy, 5, count)
         assert len(frames) == count
         assert [frame.action is None for frame in frames] == [False] * (count - 1) + [True]
+
+
+def test_the_times_of_a_walk_count_a_second_an_action() -> None:
+    still = SimpleNamespace(observe=lambda: make_frames(1)[0], cells=lambda: None, act=lambda action: True)
+    frames = walk(still, lambda *_: (name for name in ["stay"] * 3), np.random.default_rng(0), 4)  # type: ignore[arg-type]
+    assert [frame.timestamp for frame in frames] == [0.0, 1.0, 2.0, 3.0]
 
 
 @IN_THE_DARK

@@ -137,6 +137,28 @@ def test_tum_poses_are_interpolated_between_true_ones_that_are_near(tmp_path: Pa
     assert Rotation.from_matrix(found[2][:3, :3]).as_euler("zyx", degrees=True) == pytest.approx([22.5, 0, 0])
 
 
+def test_a_tum_pose_is_near_its_time_and_repeated_times_change_none(tmp_path: Path) -> None:
+    times = (1.0, 1.0, 1.05, 1.1, 1.15)
+    path = tmp_path / "groundtruth.txt"
+    path.write_text("\n".join(f"{time} {100 * (time - 1)} 0 0 0 0 0 1" for time in times))
+    found = poses_at(np.array([1.019, 1.025, 1.131]), read_listing(path, 7), path)
+    assert [None if pose is None else pytest.approx(pose[0, 3]) for pose in found] == [1.9, None, 13.1]
+    path.write_text("\n".join(f"{time} 0 0 0 0 0 0 1" for time in (1.0, 1.06)))
+    assert poses_at(np.array([1.03]), read_listing(path, 7), path) == [None]
+
+
+def test_tum_depth_belongs_to_the_colours_nearest_in_time_in_whatever_order_it_is_listed(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "room")
+    times = [line.split() for line in (folder / "depth.txt").read_text().splitlines()[1:]]
+    late = [[f"{float(time) + 0.03 * (number == 2):.6f}", file] for number, (time, file) in enumerate(times)]
+    (folder / "depth.txt").write_text("\n".join(" ".join(words) for words in reversed(late)))
+    frames = [frame for frame in read("tum", folder).frames if not isinstance(frame, DataError)]
+    truth = list(ROOM.frames(walk(24)))
+    assert len(frames) == 4
+    for number, frame in zip((1, 3, 4, 5), frames, strict=True):
+        assert np.abs(frame.depth - truth[number].depth)[1:].max() < EXACT["tum"]
+
+
 @pytest.mark.parametrize(
     ("file", "text", "cause"),
     [

@@ -37,7 +37,7 @@ def seen_bent(lens: Lens, size: tuple[int, int]) -> np.ndarray:
     return np.rint(content(x, y)).astype(np.uint8)
 
 
-@pytest.mark.parametrize("distortion", [(0.3, 0, 0, 0, 0), (-0.2, 0.1, 0.02, -0.015, 0.05)])
+@pytest.mark.parametrize("distortion", [(0.3, 0, 0, 0, 0), (-0.2, 0.1, 0.02, -0.015, 0.05), (0.3, 0, 0, 0, 0.8)])
 def test_undistorted_colours_are_where_a_pinhole_camera_sees_them(distortion) -> None:
     lens, size = Lens(50.0, 52.0, 33.0, 23.5, distortion), (48, 64)
     bent, truth = seen_bent(lens, size), seen(lens, size)
@@ -85,6 +85,9 @@ def test_the_same_lens_changes_no_pixel() -> None:
 def test_depth_that_sees_far_beyond_the_colours_is_refused() -> None:
     with pytest.raises(DataError, match="reaches far beyond the colours"):
         retake(seen(LENS, (48, 64)), LENS, Lens(40.0, 42.0, 33.0, 23.5), (48, 64))
+    for beyond in (Lens(50.0, 42.0, 33.0, 23.5), Lens(40.0, 52.0, 33.0, 23.5), Lens(50.0, 52.0, 33.0, 17.5)):
+        with pytest.raises(DataError, match="reaches far beyond the colours"):
+            retake(seen(LENS, (48, 64)), LENS, beyond, (48, 64))
 
 
 def test_a_lens_follows_the_size_of_its_images_but_not_another_aspect() -> None:
@@ -93,3 +96,5 @@ def test_a_lens_follows_the_size_of_its_images_but_not_another_aspect() -> None:
     assert Lens(50.0, 52.0, 33.0, 23.5).of((24, 32)).fx == 50.0
     with pytest.raises(DataError, match="24×24 pixels, its camera is of 48×64, which is another aspect"):
         LENS.of((24, 24))
+    with pytest.raises(DataError, match="24×48 pixels, its camera is of 48×64, which is another aspect"):
+        LENS.of((24, 48))

@@ -113,6 +113,17 @@ def test_a_folder_of_scans_is_as_many_scenes(tmp_path: Path) -> None:
         stray(tmp_path / "nowhere")
 
 
+def test_a_row_of_a_scan_belongs_to_the_pictures_of_its_number(tmp_path: Path) -> None:
+    scan = write_stray(tmp_path / "scan")
+    lines = (scan / "odometry.csv").read_text().splitlines()
+    (scan / "odometry.csv").write_text("\n".join([lines[0], lines[2], lines[4]]))
+    truth, frames = list(ROOM.frames(walk(24))), list(stray(scan).frames)
+    for number, frame in zip((1, 3), frames, strict=True):
+        assert np.array_equal(frame.rgb, truth[number].rgb)
+        assert np.abs(frame.depth - truth[number].depth)[1:].max() < 0.00051
+    assert [frame.timestamp for frame in frames] == pytest.approx([0.0, 0.2])
+
+
 def test_a_scan_without_confidence_keeps_all_depth(tmp_path: Path) -> None:
     scan = write_stray(tmp_path / "room", 2)
     shutil.rmtree(scan / "confidence")

@@ -31,6 +31,10 @@ def end_of(names: tuple[str, ...]) -> tuple[float, float]:
     return x, y
 
 
+def test_a_waypoint_nearer_than_two_steps_turns_nobody():
+    assert follow_waypoints([(0.25, 0.25), (1.0, 0.0)], *gait(walking_actions()), 2) == ("forward", "forward")
+
+
 @pytest.mark.parametrize("name", WAYS)
 def test_the_actions_end_within_half_a_step_of_the_last_waypoint(name):
     names = follow_waypoints(WAYS[name], *gait(walking_actions()), 60)
