@@ -189,6 +189,23 @@ def test_the_pull_grows_with_the_weight_and_not_with_the_scores():
     assert pull(0.3).norm().item() == pytest.approx(once.norm().item(), rel=0.05)
 
 
+def test_the_penalty_of_steep_scores_has_the_weight_of_the_settings():
+    model, _ = trained_against()
+    clips = random_clips(2)
+    none, once, thrice = (
+        adversarial_loss(model, clips, model.discriminator, Adversarial(penalty=penalty, steps=4, width=8))["loss"]
+        for penalty in (1e-30, 0.5, 1.5)
+    )
+    assert once > none
+    assert (thrice - none).item() == pytest.approx(3 * (once - none).item(), rel=1e-3)
+
+
+@pytest.mark.parametrize("width", [8, 12])
+def test_the_first_block_of_the_discriminator_is_as_wide_as_the_settings_say(width):
+    model, _ = trained_against(Adversarial(steps=4, width=width))
+    assert model.discriminator.layers[0].out_channels == width
+
+
 def test_a_step_of_the_shared_optimizer_trains_both():
     model, parameters = trained_against()
     before = {name: parameter.detach().clone() for name, parameter in parameters.items()}

@@ -8,7 +8,7 @@ import torch
 
 from persist_backbones.cogvideox.codec import decode_depth, encode_depth, fill_missing
 from persist_backbones.cogvideox.diffusion import loss_weights
-from persist_backbones.cogvideox.inputs import camera_latents, interaction_rows
+from persist_backbones.cogvideox.inputs import camera_latents, camera_tokens, interaction_rows, model_input
 from persist_cli.api.backbone import Backbone, Sampling
 from persist_cli.errors import CheckpointError, DataError, PersistError
 from tests.support.micro_model import micro, random_clips, shaken
@@ -30,6 +30,32 @@ def test_filling_missing_depth_keeps_measured_values_and_leaves_no_hole():
 
 def test_nine_frames_of_rays_become_three_latent_frames_of_24_channels():
     assert camera_latents(random_clips(1).cameras, 4, 4, False).shape == (1, 3, 24, 8, 8)
+
+
+def test_a_latent_pixel_has_the_rays_through_its_middle_of_the_frames_it_stands_for():
+    rays = camera_latents(random_clips(1, size=(9, 16, 32)).cameras, 4, 4, False)[0].unflatten(1, (4, 6))
+    focal, row, column = 32 * 0.7, 1, 6  # of a wide image, whose cameras look ahead
+    x, y = (4 * column + 2 - 16) / focal, (4 * row + 2 - 8) / focal
+    for latent, frames in enumerate([(0, 0, 0, 0), (1, 2, 3, 4), (5, 6, 7, 8)]):
+        ahead = 0.25 * torch.tensor(frames)
+        expected = torch.stack([-y * ahead, x * ahead, 0 * ahead, *(torch.full((4,), d) for d in (x, y, 1.0))], dim=1)
+        torch.testing.assert_close(rays[latent, :, :, row, column], expected)
+
+
+def test_a_video_token_has_the_mean_of_the_camera_over_its_patch():
+    latents = torch.arange(2 * 4 * 6.0).reshape(1, 2, 1, 4, 6)  # of frames, rows and columns
+    tokens = camera_tokens(latents, 2)
+    assert tokens[0, :, 0].tolist() == [24 * frame + 12 * row + 2 * c + 3.5 for frame in (0, 1) for row in (0, 1)
+                                        for c in (0, 1, 2)]  # fmt: skip
+    folded = camera_tokens(latents, 2, frames=2)
+    assert folded[0, 1].tolist() == [5.5, 29.5]  # of both frames
+
+
+@pytest.mark.parametrize("depth", [True, False])
+def test_the_model_takes_colour_and_its_image_then_depth_and_its_image_then_the_camera(depth):
+    noisy, image, camera = torch.tensor([1.0, 2.0]), torch.tensor([3.0, 4.0]), torch.tensor([5.0])
+    taken = model_input(*(part[None, None, :, None, None] for part in (noisy, image, camera)), depth)
+    assert taken.flatten().tolist() == ([1, 3, 2, 4, 5] if depth else [1, 3, 0, 0, 5])
 
 
 @pytest.mark.parametrize("sampler", ["ddim", "dpm"])

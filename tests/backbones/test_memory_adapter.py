@@ -1,12 +1,13 @@
 """Every form of memory adapter: a fresh one changes nothing, and a trained one depends on its tokens alone."""
 
 import dataclasses
+import math
 
 import pytest
 import torch
 
 from persist_backbones.adapters.cross import token_rays
-from persist_backbones.adapters.memory_block import position_code
+from persist_backbones.adapters.memory_block import MemoryBlock, Modulation, position_code
 from persist_backbones.cogvideox.diffusion import sample_generators
 from persist_cli.api.actions import rotation_about
 from persist_cli.api.backbone import Sampling
@@ -163,6 +164,32 @@ def test_tokens_without_positions_are_a_set_of_features_unless_keys_have_rays(op
     assert same is not matters
 
 
+@pytest.mark.parametrize("normalize", [True, False])
+def test_normalized_features_count_whatever_their_length(normalize):
+    backbone, clips, tokens = with_adapter(micro(), normalize=normalize), random_clips(), random_tokens(2, 9)
+    shaken(backbone)
+    longer = dataclasses.replace(tokens, features=7 * tokens.features)
+    same = torch.allclose(predicted(backbone, clips, tokens), predicted(backbone, clips, longer), atol=1e-3)
+    assert same is normalize
+
+
+@pytest.mark.parametrize(
+    "options", [options for options in CROSS if "key_camera" in options], ids=lambda options: "+".join(options)
+)
+def test_with_rays_in_the_keys_a_sample_does_not_see_the_memory_of_another(options):
+    backbone, clips, tokens = with_adapter(micro(), **options), random_clips(), random_tokens(2, 9)
+    shaken(backbone)
+    features = tokens.features * torch.tensor([1.0, -2.0])[:, None, None]
+    mask = tokens.mask & torch.tensor([[True], [False]])
+    before, changed, hidden = (
+        predicted(backbone, clips, dataclasses.replace(tokens, features=values, mask=there))
+        for values, there in ((tokens.features, tokens.mask), (features, tokens.mask), (tokens.features, mask))
+    )
+    assert torch.allclose(before[0], changed[0], atol=1e-5)
+    assert torch.allclose(before[0], hidden[0], atol=1e-5)
+    assert not torch.allclose(before[1], changed[1], atol=1e-5)
+
+
 def test_the_ray_to_a_token_has_the_direction_of_the_pixel_that_sees_it():
     clips = random_clips(batch=1)
     cameras = dataclasses.replace(clips.cameras, world_from_camera=clips.cameras.world_from_camera.clone())
@@ -188,6 +215,14 @@ def test_queries_and_keys_have_the_same_code_of_a_direction():
 def test_a_code_of_rays_needs_the_rays():
     with pytest.raises(CheckpointError, match="give key_camera=true"):
         with_adapter(micro(), ray_frequencies=3)
+
+
+def test_keys_have_the_code_of_positions_where_the_settings_say_so():
+    clips, tokens = random_clips(), random_tokens(2, 9)
+    adapter = with_adapter(micro(), key_positions=True).adapter
+    code = adapter.position_code(tokens, clips.cameras)
+    assert torch.equal(adapter.prepare(tokens, clips.cameras).codes[:, 0], code)
+    assert with_adapter(micro()).adapter.prepare(tokens, clips.cameras).codes is None
 
 
 def test_positions_in_the_keys_need_positions():
@@ -229,6 +264,47 @@ def test_memory_guidance_of_weight_one_changes_nothing_and_more_moves_away_from_
     )
 
 
+def test_shift_scale_and_gate_of_the_memory_are_its_own_and_those_of_the_video_are_the_videos():
+    torch.manual_seed(0)
+    block = MemoryBlock(video_channels=8, camera_channels=6, width=4, heads=2, ff_factor=1.0, time_channels=5)
+    shaken(block, 1.0)
+    inputs = {"memory": torch.randn(1, 3, 4), "mask": torch.ones(1, 3, dtype=torch.bool)}
+    inputs |= {"camera": torch.randn(1, 2, 6), "time": torch.randn(1, 5)}
+    video, others = torch.randn(1, 2, 8), torch.randn(1, 3, 4)
+
+    def after(**modulation):
+        """The change of the video by two memories; what is not named of shift, scale and gate is zero."""
+        parts = [
+            torch.full((size,), modulation.get(name, 0.0))
+            for name, size in zip(Modulation._fields, block.sizes, strict=True)
+        ]
+        with torch.no_grad():
+            block.modulation.weight.zero_()
+            block.modulation.bias.copy_(torch.cat(parts))
+            return [block(video, **inputs | {"memory": memory}) - video for memory in (inputs["memory"], others)]
+
+    one, other = after(video_gate=-1.0)
+    assert one.any()
+    assert not torch.allclose(one, other, atol=1e-3)
+    assert not any(change.any() for change in after(video_gate=-1.0, memory_gate=-1.0))
+    for closed in ({"memory_gate": -1.0}, {"memory_scale": -1.0, "memory_shift": 0.5}):
+        one, other = after(**closed)
+        assert one.any()
+        assert torch.allclose(one, other, atol=1e-6)
+    scaled, plain = after(video_gate=-1.0, video_scale=0.7)[0], after(video_gate=-1.0)[0]
+    assert not torch.allclose(scaled, plain, atol=1e-3)
+
+
+def test_memory_tokens_count_by_their_direction_whatever_their_length():
+    torch.manual_seed(0)
+    block = MemoryBlock(video_channels=8, camera_channels=6, width=4, heads=2, ff_factor=1.0, time_channels=5)
+    shaken(block, 1.0)
+    video, memory, mask = torch.randn(1, 2, 8), torch.randn(1, 3, 4), torch.ones(1, 3, dtype=torch.bool)
+    camera, time = torch.randn(1, 2, 6), torch.randn(1, 5)
+    once, longer = (block(video, factor * memory, mask, camera, time) for factor in (10.0, 20.0))
+    assert torch.allclose(once, longer, atol=1e-3)
+
+
 def test_an_adapter_has_a_block_at_every_nth_layer():
     assert set(with_adapter(micro(), every=2).adapter.blocks) == {"1"}
     assert set(with_adapter(micro()).adapter.blocks) == {"0", "1"}
@@ -266,3 +342,12 @@ def test_the_position_code_is_bounded_and_differs_between_cells():
     code = position_code(torch.tensor([[0.0, 0, 0], [0.25, 0, 0], [60.0, 0, 0]]), 10)
     assert code.abs().max() <= 1
     assert torch.pdist(code).min() > 0.5
+
+
+def test_wavelengths_of_the_position_code_go_from_the_shortest_to_the_longest_in_equal_ratios():
+    near, far = (position_code(torch.tensor([[place, 0.0, 0.0]]), 3, 0.5, 8.0)[0, :6] for place in (0.5, 2.0))
+    quarter = torch.tensor([0.25 * 2 * math.pi, 2 * math.pi / 16])
+    assert torch.allclose(
+        near, torch.cat([torch.tensor([0.0]), quarter.sin(), torch.tensor([1.0]), quarter.cos()]), atol=1e-6
+    )
+    assert torch.allclose(far[:3], torch.tensor([0.0, 0.0, 1.0]), atol=1e-6)

@@ -149,3 +149,35 @@ def test_a_projected_token_has_the_code_of_the_video_token_on_its_ray():
     places, seen = image_places(token_at(*(3 * ray).tolist()), cameras)
     assert seen[:, 0].all()
     assert torch.allclose(adapter.code(places[0, 0, 0, :2]), adapter.query_places(cameras)[1 * 4 + 2], atol=1e-5)
+
+
+def test_in_a_wide_image_too_a_projected_token_has_the_code_of_the_video_token_on_its_ray():
+    adapter = with_adapter(micro(), form="projected").adapter
+    cameras = random_clips(size=(9, 16, 32)).cameras
+    pixel = torch.tensor([28.0, 4.0, 1.0], dtype=torch.float64)  # the middle of video token (0, 3) of 2 × 4
+    ray = torch.linalg.inv(cameras.intrinsics[0, 0]) @ pixel
+    places, seen = image_places(token_at(*(3 * ray).tolist()), cameras)
+    assert seen[:, 0].all()
+    assert torch.allclose(adapter.code(places[0, 0, 0, :2]), adapter.query_places(cameras)[3], atol=1e-5)
+
+
+@pytest.mark.parametrize("form", ["cross", "projected"])
+def test_each_clip_of_a_batch_has_the_modulation_of_its_own_time(form):
+    backbone, clips, tokens = trained(form), random_clips(), random_tokens(2, 40)
+    memory = backbone.memory_condition(dataclasses.replace(clips, tokens=tokens))
+    video, camera, time = torch.randn(2, 48, 64), torch.randn(2, 48, 24), torch.randn(2, 32)
+    before, after = (memory.after(0, video, camera, now) for now in (time, time + torch.tensor([[1.0], [0.0]])))
+    assert torch.allclose(before[1], after[1], atol=1e-5)
+    assert not torch.allclose(before[0], after[0], atol=1e-3)
+
+
+def test_a_frame_that_does_not_see_a_token_tells_nothing_of_its_place(monkeypatch):
+    adapter, told = with_adapter(micro(), form="projected").adapter, []
+    place = adapter.place.forward
+    monkeypatch.setattr(adapter.place, "forward", lambda code: told.append(code) or place(code))
+    adapter.prepare(token_at(0.0, 0.0, 1.0), random_clips().cameras)  # which frame 4 has passed
+    first, second = told[0][0, :2, 0].unflatten(-1, (4, -1))
+    assert first[:, -1].tolist() == [1.0] * 4
+    assert second[:, -1].tolist() == [1.0, 1.0, 1.0, 0.0]
+    assert second[:3].any(dim=1).all()
+    assert not second[3].any()

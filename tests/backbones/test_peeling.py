@@ -5,9 +5,9 @@ import dataclasses
 import pytest
 import torch
 
-from persist_backbones.adapters.peeling import LayerEmbedding, peel
+from persist_backbones.adapters.peeling import VALUES, LayerEmbedding, peel
 from persist_backbones.adapters.rendered import RenderedSettings, render_views
-from persist_backbones.adapters.splat import coarser
+from persist_backbones.adapters.splat import Splats, coarser
 from persist_cli.api.observations import Origin
 from persist_cli.api.tokens import MemoryTokens
 from persist_cli.errors import CheckpointError
@@ -66,6 +66,24 @@ def test_the_order_of_tokens_does_not_matter():
     assert torch.equal(surfaces(flipped), one)
 
 
+@pytest.mark.parametrize("value", range(VALUES))
+def test_the_embedding_tells_each_value_of_each_surface(value):
+    torch.manual_seed(0)
+    embedding = LayerEmbedding(layers=2, classes=4, class_channels=8, width=16)
+    surfaces = torch.tensor([2.0, 0.2, 0.4, 0.6, 1.5, 1.0]).repeat(1, 2, 1)
+    for layer in (0, 1):
+        other = surfaces.clone()
+        other[0, layer, value] -= 0.75 if value else 1.0
+        assert not torch.allclose(embedding(other), embedding(surfaces), atol=1e-4)
+
+
+def test_a_coarser_pixel_has_the_splats_of_its_own_part_of_a_wide_image():
+    pixels = torch.arange(2 * 4 * 8)
+    drawn = coarser(Splats(pixels, 0 * pixels, pixels.double()), (4, 8), (2, 4)).pixel
+    frame, row, column = pixels // 32, pixels % 32 // 8, pixels % 8
+    assert torch.equal(drawn, (2 * frame + row // 2) * 4 + column // 2)
+
+
 def test_nothing_embeds_to_zero_and_another_class_to_something_else():
     torch.manual_seed(0)
     embedding = LayerEmbedding(2, 4, 8, 16)
@@ -99,6 +117,24 @@ def test_a_trained_adapter_sees_the_class_of_what_is_hidden():
     without = with_adapter(micro(), **LAYERS | {"layers": 1})
     shaken(without)
     assert torch.equal(predicted(without, clips, one), predicted(without, clips, other))
+
+
+def test_what_is_embedded_of_kept_layers_are_the_surfaces_of_each_pixel(monkeypatch):
+    adapter, clips, read = with_adapter(micro(), **LAYERS, token_size=0.2).adapter, random_clips(1), []
+
+    def recorded(pixels):
+        read.append(pixels)
+        return pixels.new_zeros(len(pixels), adapter.settings.layer_width)
+
+    monkeypatch.setattr(adapter.layers, "forward", recorded)
+    tokens = in_line([2.5, 6.0], classes=[1, 3])
+    adapter.prepare(adapter.render(tokens, clips.cameras, lambda *_: torch.zeros(1, 3, 8, 8, 8)), clips.cameras)
+    shown = {
+        tuple(surface) for surface in read[0].reshape(-1, 12).double().round(decimals=2).tolist() if surface[6] > 0
+    }
+    assert {(one[:4], one[6:10]) for one in shown} == {((2.0, 0.2, 0.2, 0.2), (4.0, 0.4, 0.4, 0.4))}
+    assert {(one[5], one[11]) for one in shown} == {(1.0, 1.0)}  # both were observed
+    assert {round(2 ** one[10] - 2 ** one[4], 1) for one in shown} == {3.5}
 
 
 def test_training_reaches_the_embedding_of_classes():

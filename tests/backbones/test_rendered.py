@@ -1,11 +1,12 @@
 """The form ``rendered``: what is drawn, what goes through the codec, and how it moves the prediction."""
 
 import dataclasses
+import json
 
 import pytest
 import torch
 
-from persist_backbones.adapters.rendered import RenderedSettings, render_views, tokens_not_shown
+from persist_backbones.adapters.rendered import RenderedAdapter, RenderedSettings, render_views, tokens_not_shown
 from persist_backbones.cogvideox.diffusion import noise_level
 from persist_backbones.tensors import push_pull
 from persist_cli.api.backbone import Sampling
@@ -163,6 +164,18 @@ def test_a_fresh_adapter_predicts_from_noise_what_it_renders_and_nearly_leaves_w
     assert (clean - bare).abs().max() < 0.1 * (memory.latents - bare).abs().max()
 
 
+@pytest.mark.parametrize("prediction", ["sample", "v_prediction"])
+def test_a_fresh_adapter_takes_the_weighted_mean_of_what_it_renders_and_what_is_predicted(prediction):
+    errors = {"color_error": 0.05, "depth_error": 0.4}
+    backbone, clips = with_adapter(micro(prediction=prediction), form="rendered", **WIDE, **errors), random_clips()
+    bare, _ = clean_of(backbone, clips, None, 300)
+    clean, memory = clean_of(backbone, clips, wall(), 300)
+    level = noise_level(backbone.scheduler, torch.tensor([300]))
+    snr = (level.signal / level.noise).square().item()
+    gates = torch.tensor([1 / (1 + 1 / 64 + snr * error) for error in errors.values()]).repeat_interleave(4)
+    assert torch.allclose(clean, bare + gates[:, None, None] * (memory.latents - bare), atol=1e-3)
+
+
 def test_a_fresh_adapter_trusts_drawn_colours_less_the_larger_their_error_and_depth_as_before():
     clips = random_clips()
     sure, unsure = (with_adapter(micro(), form="rendered", **WIDE, color_error=error) for error in (0.05, 1.0))
@@ -206,6 +219,19 @@ def test_what_is_kept_of_tokens_depends_on_the_codec_and_on_how_they_are_drawn()
     assert with_adapter(micro(), form="canvas").token_encoding() == ""
 
 
+@pytest.mark.parametrize(("layers", "changes"), [
+    (0, [{"splat_pixels": 5}, {"hole_share": 0.0}, {"thickness": 0.1}, {"supersampling": 1}, {"attention_tokens": 8}]),
+    (2, [{"layers": 3}, {"layer_gap": 0.1}, {"layer_scale": 1}, {"classes": 4}]),
+])  # fmt: skip
+def test_what_is_kept_of_tokens_depends_on_each_setting_of_their_drawing(layers, changes):
+    video = micro().video_shape
+    kept = [
+        RenderedAdapter(CHANNELS, RenderedSettings(**{"layers": layers} | change), video).rendering()
+        for change in ({}, *changes)
+    ]
+    assert len({json.dumps(settings, sort_keys=True) for settings in kept}) == 1 + len(changes)
+
+
 def test_attention_reads_tokens_that_are_hidden_or_just_out_of_sight_and_no_others():
     clips = random_clips()
     places = [[0.0, 0.0, 3.0], [0.0, 0.0, 5.0], [0.0, 0.0, -1.0], [2.4, 0.0, 3.0], [9.0, 0.0, 3.0]]
@@ -217,6 +243,10 @@ def test_attention_reads_tokens_that_are_hidden_or_just_out_of_sight_and_no_othe
     shown = render_views(tokens, one, RenderedSettings(token_size=0.5)).shown
     assert shown[0].tolist() == [True, False, False, False, False]
     assert tokens_not_shown(tokens, shown, one, 4)[0].tolist() == [1, 3, -1, -1]
+    adapter = with_adapter(micro(), form="rendered", token_size=0.5, attention_tokens=4).adapter
+    kept = adapter.render(tokens, one, lambda rgb, depth: torch.zeros(2, 1, 8, 8, 8))
+    assert kept.mask[0].tolist() == [True, True, False, False]
+    assert kept.positions[0, :2].tolist() == [places[1], places[3]]
 
 
 def test_a_larger_choice_of_hidden_tokens_is_spread_over_them():

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from persist_backbones.adapters.splat import Splats, hide_covered, rasterize, splat
+from persist_backbones.adapters.splat import Splats, hide_covered, holes, rasterize, splat
 from persist_cli.api.actions import rotation_about
 from persist_cli.api.cameras import Cameras
 
@@ -14,7 +14,7 @@ def views(frames: int = 1) -> Cameras:
     """Cameras at the origin that look along z."""
     matrix = torch.tensor([[FOCAL, 0, SIDE / 2], [0, FOCAL, SIDE / 2], [0, 0, 1]], dtype=torch.float64)
     poses = torch.eye(4, dtype=torch.float64).expand(1, frames, 4, 4).clone()
-    return Cameras(poses, matrix.expand(1, frames, 3, 3), SIDE, SIDE)
+    return Cameras(poses, matrix.repeat(1, frames, 1, 1), SIDE, SIDE)
 
 
 def on_ray(column: float, row: float, depth: float) -> list[float]:
@@ -38,6 +38,13 @@ def test_a_token_on_a_ray_lands_on_its_pixel_and_nowhere_else(column, row):
     assert value[row, column] == 7
     assert logs[row, column] == pytest.approx(torch.tensor(3.0).log().item())
     assert value.count_nonzero() == logs.count_nonzero() == 1
+
+
+def test_a_token_is_wide_by_the_one_focal_length_and_high_by_the_other():
+    cameras = views()
+    cameras.intrinsics[..., 1, 1] = FOCAL / 2
+    coverage = draw([[0.0, 0.0, 2.0]], [1.0], cameras, size=8 / FOCAL, most=9)[1]  # 4 pixels wide
+    assert [int(coverage.any(dim=axis).sum()) for axis in (0, 1)] == [4, 2]
 
 
 @pytest.mark.parametrize("order", [1, -1])
@@ -158,6 +165,14 @@ def test_a_share_of_zero_leaves_holes_as_they_are():
 
 def test_what_is_hardly_farther_is_the_same_surface():
     assert seen(with_holes(2.0, 2.1)).all()
+
+
+def test_with_a_share_of_one_a_hole_is_what_has_something_nearer_all_around_it():
+    nearest = torch.full((1, 5, 5), 2.0)
+    nearest[0, 2, 2] = 5.0
+    assert holes(nearest, 1.0).nonzero().tolist() == [[0, 2, 2]]
+    nearest[0, 0, 0] = 5.0
+    assert not holes(nearest, 1.0).any()
 
 
 @pytest.mark.parametrize("turned", [False, True])

@@ -13,7 +13,7 @@ from diffusers import (
 )
 
 from persist_backbones.cogvideox.diffusion import noise_like, sample_generators
-from persist_backbones.cogvideox.inputs import ClipShape, middle_region
+from persist_backbones.cogvideox.inputs import ClipShape, middle_region, rotary_grid, rotary_positions
 from persist_backbones.pipeline.pipeline import WorldPipeline
 from persist_cli.api.backbone import Sampling
 from persist_cli.errors import CheckpointError
@@ -229,6 +229,24 @@ def test_rotary_positions_at_another_size_are_those_of_diffusers_for_the_middle_
     assert middle_region((32, 32), (30, 45)) == ((0, 8), (30, 38))  # 512x512 in the grid of 480x720
     for twin in (model, loaded):
         assert equal(twin.conditions(random_clips(1, size=SHORTER), torch.tensor([3])).rotary, expected)
+
+
+def test_rotary_positions_of_a_wide_image_are_those_of_diffusers(twins):
+    pipe = plain_pipeline(twins["5b"], "5b")
+    config, height, width, frames = pipe.transformer.config, 32, 64, 4
+    expected = pipe._prepare_rotary_positional_embeddings(height, width, frames, torch.device("cpu"))
+    unit = pipe.vae_scale_factor_spatial * config.patch_size
+    grid = (frames, height // unit, width // unit)
+    assert equal(rotary_positions(config, grid, rotary_grid(config), torch.device("cpu")), expected)
+
+
+@pytest.mark.parametrize(("frames", "token_frames"), [(3, 1), (3, 2)])
+@pytest.mark.parametrize("known", [1, 3])
+def test_the_given_frame_is_the_first_of_the_image_condition_and_views_of_it_are_the_last(frames, token_frames, known):
+    shape = ClipShape(frames, 1, 1, patch=1, token_frames=token_frames)
+    latents = torch.arange(1.0, 1 + known)[None, :, None, None, None]
+    padding = [0.0] * (shape.padded_frames - known)
+    assert shape.image_condition(latents).flatten().tolist() == [1.0, *padding, *[2.0, 3.0][: known - 1]]
 
 
 @every_model

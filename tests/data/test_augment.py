@@ -106,3 +106,16 @@ def test_without_augmentation_no_random_number_is_drawn(walks):
     random = np.random.default_rng(0)
     assert Augmentation().draw(Store(walks)[0].info, (SIZE, SIZE), random) is None
     assert random.random() == np.random.default_rng(0).random()
+
+
+def test_views_are_mirrored_cut_and_coloured_as_often_and_as_far_as_the_settings_say(walks):
+    info, random = Store(walks)[0].info, np.random.default_rng(0)
+    drawn = [Augmentation(crop=0.5, mirror=0.25, color_jitter=0.3).draw(info, (SIZE, SIZE), random) for _ in range(400)]
+    assert np.mean([view.mirrored for view in drawn]) == pytest.approx(0.25, abs=0.06)
+    heights = np.array([view.window.window[0] / SIZE for view in drawn])
+    assert (heights.min(), heights.max()) == pytest.approx((0.5, 1.0), abs=0.03)
+    assert heights.std() > 0.1
+    gains = np.array([view.gains for view in drawn])
+    assert gains.min() >= 0.7**2
+    assert 1.3 < gains.max() <= 1.3**2
+    assert gains.mean() == pytest.approx(1.0, abs=0.03)

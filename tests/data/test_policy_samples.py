@@ -11,7 +11,7 @@ import torch
 
 from persist_cli.api.actions import rotation_about
 from persist_cli.api.policy_network import PolicySample, SampleForm
-from persist_cli.data.policy_samples import GroundPath, PolicySampleDataset, ground_places, local_places
+from persist_cli.data.policy_samples import GroundPath, PolicySampleDataset, SampleFrames, ground_places, local_places
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError
 from tests.support.rooms import UP, Room, look
@@ -164,3 +164,20 @@ def test_data_that_policies_cannot_learn_from_is_refused_in_one_line(walks, tmp_
         PolicySampleDataset([walks], dataclasses.replace(FORM, waypoints=30), 0)
     with pytest.raises(DataError, match=r"straight.parquet: images are 8x8, those of .* are 32x32"):
         PolicySampleDataset([walks, write_straight(tmp_path)], FORM, 0)
+
+
+def test_so_many_goals_are_of_another_walk_and_so_many_samples_mirrored_as_the_settings_say(tmp_path):
+    write_straight(tmp_path)
+    samples = PolicySampleDataset([write_straight(tmp_path, name="other")], FORM, 0, mirror=0.1)
+    drawn = [samples.choose(number) for number in range(400)]
+    assert np.mean([one.file != one.goal_file for one in drawn]) == pytest.approx(FORM.negatives, abs=0.07)
+    assert np.mean([one.mirrored for one in drawn]) == pytest.approx(0.1, abs=0.05)
+    own = [one.goal - one.present for one in drawn if one.file == one.goal_file]
+    assert {2, 12} <= set(own) <= {2, 4, 6, 8, 10, 12}  # one to six spacings of two frames
+
+
+def test_a_way_of_so_many_spacings_leads_to_the_goal_between_the_nearest_and_the_farthest(tmp_path):
+    samples = PolicySampleDataset([write_straight(tmp_path, frames=40)], FORM, 0)
+    read = [samples.read(SampleFrames(0, 10, 0, 10 + 2 * far, False, 0)) for far in range(1, 8)]
+    assert [sample.distance for sample in read] == [1, 2, 3, 4, 5, 6, 7]
+    assert [sample.leads_to_goal for sample in read] == [False, False, True, True, True, False, False]

@@ -18,7 +18,7 @@ from persist_cli.api.reach import CHANGED
 from persist_cli.api.scene_model import Given, SceneForm, SceneSamples
 from persist_cli.api.scene_turns import Turn
 from persist_cli.data.file_hashes import FileHashes
-from persist_cli.data.scene_samples import SampleShares, SceneSampleDataset
+from persist_cli.data.scene_samples import FIXED, JITTER, SampleShares, SceneSampleDataset
 from persist_cli.data.store import write_trajectory
 from persist_cli.errors import DataError
 from persist_cli.simulators.collect import CollectPlan, collect_frames
@@ -133,6 +133,42 @@ def test_a_turn_of_all_four_quarters_and_two_mirrors_change_nothing() -> None:
     assert torch.allclose(moved, pose)
 
 
+@pytest.mark.parametrize(("kind", "share"), [("frame", "named"), ("walk", "named"), ("interaction", "named_acting")])
+@pytest.mark.parametrize("idle", [0.0, 1.0])
+@pytest.mark.parametrize("known", [0.0, 1.0])
+def test_the_classes_of_what_was_seen_are_known_in_the_share_of_its_kind(
+    houses: Path, kind: str, share: str, idle: float, known: float
+) -> None:
+    shares = {"named": 1 - known, "named_acting": 1 - known} | {share: known}
+    dataset = samples_of(houses, kind, **shares, idle=idle)
+    for sample in map(dataset.__getitem__, range(3)):
+        solid = (sample.given > 0) & (sample.classes != FREE)
+        assert (sample.classes[solid] != SOLID).float().mean().round() == known
+
+
+def test_windows_lie_around_the_camera_and_those_of_grown_samples_anywhere_around_it(houses: Path) -> None:
+    apart = {}
+    for kind in ("frame", "grown"):
+        dataset = samples_of(houses, kind, unseen=0.0)
+        places = torch.stack([dataset[number].window_from_camera[:2, 3] for number in range(12)])
+        apart[kind] = ((places / FORM.size) - torch.tensor(WINDOW.shape[:2]) / 2).abs().amax(dim=1)
+    assert apart["frame"].max() <= JITTER + 1
+    assert (apart["frame"] < 1.01).sum() >= 2  # half of them around it
+    assert (apart["frame"] > 1.01).sum() >= 2
+    assert apart["grown"].max() > JITTER + 1
+
+
+def test_each_sample_has_noise_of_its_own(houses: Path) -> None:
+    dataset = samples_of(houses, "frame")
+    assert len({int(dataset[number].seeds) for number in range(4)}) == 4
+
+
+def test_single_frames_and_walks_come_again_and_there_are_several_of_each(houses: Path) -> None:
+    views = [samples_of(houses, "frame")[number].rgb for number in range(12)]
+    distinct = {tuple(view.float().mean((0, 1)).tolist()) for view in views}
+    assert 3 <= len(distinct) <= 2 * FIXED
+
+
 def test_a_walk_knows_more_than_a_frame(houses: Path) -> None:
     known = [sum(int((samples_of(houses, kind)[n].given > 0).sum()) for n in range(6)) for kind in ("frame", "walk")]
     assert known[1] > 1.5 * known[0]
@@ -172,6 +208,10 @@ def test_a_thing_that_is_dropped_is_there_again(houses: Path) -> None:
     sample = first_with(samples_of(houses, "interaction", idle=0.0), "drop")
     classes, _ = truths(sample)
     assert things(sample.carried)
+    assert sample.carried_color.any()
+    dropped = (sample.given != Given.CONTENT) & (classes == sample.carried)
+    away = (truths(sample)[1][dropped].float() - sample.carried_color).abs().amax(dim=-1)
+    assert away.min() < 30  # the mean of the thing's cells
     assert (classes[sample.given != Given.CONTENT] == sample.carried).any()
 
 
@@ -265,3 +305,27 @@ def test_samples_are_drawn_in_every_kind(houses: Path) -> None:
     dataset = SceneSampleDataset([houses], WINDOW, 1)
     actions = np.array([int(dataset[number].action) for number in range(40)])
     assert 0 < (actions > 0).mean() < 0.5
+
+
+def test_kinds_are_drawn_as_often_as_their_shares_say(houses: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = []
+    for kind in KINDS:
+        monkeypatch.setattr(SceneSampleDataset, f"_{kind}", lambda _, random, name=kind: drawn.append(name))
+    monkeypatch.setattr(SceneSampleDataset, "_sample", lambda *_: None)
+    dataset = SceneSampleDataset([houses], WINDOW, 1, SampleShares(frame=0.6, walk=0.0, grown=0.1, interaction=0.1))
+    for number in range(400):
+        _ = dataset[number]
+    counts = {kind: drawn.count(kind) / 400 for kind in KINDS}
+    assert counts == pytest.approx({"frame": 0.75, "walk": 0.0, "grown": 0.125, "interaction": 0.125}, abs=0.06)
+
+
+@pytest.mark.parametrize(("idle", "events"), [(0.0, 1.0), (1.0, 0.0), (0.2, 0.8)])
+def test_interactions_find_nothing_to_act_on_as_often_as_the_share_says(
+    houses: Path, monkeypatch: pytest.MonkeyPatch, idle: float, events: float
+) -> None:
+    dataset, drawn = samples_of(houses, "interaction", idle=idle), []
+    monkeypatch.setattr(dataset, "_event", lambda *_: drawn.append(1.0))
+    monkeypatch.setattr(dataset, "_idle", lambda *_: drawn.append(0.0))
+    for number in range(200):
+        dataset._interaction(np.random.default_rng(number))
+    assert np.mean(drawn) == pytest.approx(events, abs=0.08)

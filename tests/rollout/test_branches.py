@@ -50,6 +50,18 @@ def test_a_branch_imagines_what_a_single_rollout_does(start):
     assert not alike(branched[0], branched[1])
 
 
+def test_each_clip_is_told_the_interactions_before_its_own_frames(start, monkeypatch):
+    world, told = start(), []
+    denoise = world.denoise
+    monkeypatch.setattr(world, "denoise", lambda clips: told.append(clips.interactions) or denoise(clips))
+    way = world.agents[0].cameras_after(["left"] * 10)
+    for _ in world.imagine([way], [("toggle", *[None] * 7, None, "pick_up")]):
+        pass
+    first, second = (clips[0] for clips in told)
+    assert first == ("toggle", *[None] * 7)
+    assert second[:2] == (None, "pick_up")
+
+
 def test_branches_whose_views_are_drawn_read_a_map_together_and_imagine_what_a_single_rollout_does(walks):
     backbone = remembering_model({"form": "rendered", "token_budget": 100_000, "attention_tokens": 0})
     begin = functools.partial(world_on_walk, backbone, walks)

@@ -6,6 +6,7 @@ import json
 import shutil
 
 import pytest
+from accelerate import Accelerator
 
 from persist_cli.api.checkpoint import step_folders
 from persist_cli.api.training_scenes import TrainingScenes
@@ -13,9 +14,10 @@ from persist_cli.errors import CheckpointError
 from persist_cli.io.files import read_tensors
 from persist_cli.policies.trained import find_policy
 from persist_cli.recipe import make_recipe, read_recipe
+from persist_cli.train.policy_trainer import PolicyTrainer
 from persist_cli.train.training_loop import learning_rate
 from tests.support.damage import without_sums
-from tests.support.micro_policies import policy_stage
+from tests.support.micro_policies import MICRO_POLICY, micro_network, policy_stage
 from tests.support.micro_runs import equal_runs, losses, run_result
 
 
@@ -76,6 +78,20 @@ def test_a_run_on_a_base_of_unknown_scenes_does_not_know_all_of_its_own(persist,
     (without_sums(base) / "policy.json").write_text(json.dumps(card))
     assert persist(*policy_stage(walks, tmp_path / "run", f"base={base}", "training.steps=1")).code == 0
     assert find_policy(tmp_path / "run").training_scenes == TrainingScenes(frozenset(["room-0", "room-1"]), False)
+
+
+def test_samples_are_those_of_the_seed_the_mirror_and_the_detour_of_the_recipe(walks):
+    values = {
+        "stage": "policy",
+        "policy": {"name": "nomad", "settings": MICRO_POLICY},
+        "data": {"path": str(walks), "mirror": 0.25, "detour": 1.5},
+        "training": {"seed": 5},
+    }
+    samples = PolicyTrainer(
+        make_recipe(values, "mine"), micro_network(), TrainingScenes(), Accelerator(cpu=True)
+    ).dataset
+    assert (samples.seed, samples.mirror, samples.detour) == (5, 0.25, 1.5)
+    assert samples.form == micro_network().sample_form
 
 
 def test_the_learning_rate_may_follow_a_cosine():

@@ -13,6 +13,7 @@ from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.recipe import make_recipe
 from persist_cli.train.finetune import make_accelerator
 from persist_cli.train.trainer import Trainer
+from persist_cli.train.training_loop import learning_rate
 from tests.support.micro_model import FRAMEWISE, micro, with_adapter
 
 DATA = {
@@ -69,6 +70,19 @@ def test_each_setting_of_the_data_reaches_the_choice_of_clips(trainer):
 def test_segments_of_chained_samples_are_as_many_as_the_recipe_says(trainer):
     with pytest.raises(DataError, match="3 segments of a clip need 25 frames, the longest trajectory has 24"):
         trainer(own_writes=0.5, own_segments=3, strides=[1])
+
+
+def test_each_step_is_taken_at_the_learning_rate_of_the_schedule(walks):
+    small = {"workers": 0, "batch": 1, "warmup": 4, "steps": 9, "cooldown": 2}
+    values = {"stage": "1", "base": "elsewhere", "data": {"path": str(walks)}, "training": small}
+    training = Trainer(make_recipe(values, "mine"), micro(**FRAMEWISE), None, Accelerator(cpu=True))
+    settings, taken = training.recipe.training, []
+    for step in (0, 1, 8):  # it rises, and falls in the end
+        training.state.step = step
+        next(training.steps())
+        taken.append(training.optimizer.param_groups[0]["lr"])
+    assert taken == [learning_rate(settings, step) for step in (0, 1, 8)]
+    assert 0 < taken[0] < taken[1] < settings.learning_rate
 
 
 def test_fresh_weights_depend_on_the_seed_of_the_recipe(fresh_accelerator, tmp_path):

@@ -7,14 +7,20 @@ import shutil
 from dataclasses import asdict
 
 import pytest
+from accelerate import Accelerator
 
 from persist_cli.api.cells import COMMON
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.scene_model import SceneSamples
+from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.checkpoints.scene_models import find_scene_model
+from persist_cli.data.scene_samples import SampleShares
 from persist_cli.errors import CheckpointError
 from persist_cli.io.files import read_tensors
 from persist_cli.memorize.memory_file import load_memory
+from persist_cli.plugins import make_scene_model
+from persist_cli.recipe import make_recipe
+from persist_cli.train.scene_trainer import ACTING, WHOLE_CELLS, SceneTrainer
 from persist_memory.scene_models.scene_diffusion import SceneDiffusion
 from tests.support.cell_houses import FORM, write_cell_houses, write_interactions
 from tests.support.micro_runs import equal_runs, losses, run_persist
@@ -58,6 +64,23 @@ def test_a_run_of_each_stage_leaves_what_it_trained_with_its_scenes(runs):
     assert (found.plugin, found.stage, found.training_scenes.names) == ("scene", "scene", {"house-0", "house-1"})
     assert {"cross_entropy", "color_error", "wrong_solid"} < set(json.loads(first_line(runs / "codec")))
     assert len(losses(runs / "scene")) == 4
+
+
+@pytest.mark.parametrize(
+    ("stage", "shares"), [("scene-codec", WHOLE_CELLS), ("scene", SampleShares()), ("scene-outcome", ACTING)]
+)
+def test_each_stage_has_samples_of_its_kinds_by_the_seed_of_the_recipe(acted, stage, shares):
+    settings = MICRO_SCENE | {"palette": list(FORM.palette)}
+    values = {
+        "stage": stage,
+        "base": "elsewhere",
+        "scene": {"name": "scene", "settings": settings},
+        "data": {"path": str(acted)},
+        "training": {"seed": 5},
+    }
+    model, recipe = make_scene_model("scene", settings), make_recipe(values, "mine")
+    samples = SceneTrainer(recipe, model, TrainingScenes(), Accelerator(cpu=True)).dataset
+    assert (samples.seed, samples.shares, samples.form) == (5, shares, model.form)
 
 
 def first_line(run):
