@@ -136,5 +136,7 @@ def clips_along(model: WorldModel, paths: Sequence[CameraPath]) -> Iterator[list
     if all(path.truth is None for path in paths):
         yield from model.act([path.actions for path in paths])
         return
+    if any(agent.scene is not None for agent in model.agents) and any(any(path.interactions) for path in paths):
+        warn("warning: along given poses interactions do not change the scene; --actions, without --follow, does it")
     for frames in model.imagine([path.cameras for path in paths], [path.interactions for path in paths]):
         yield [StepResult(seen, torch.ones(len(seen), dtype=torch.bool)) for seen in frames]

@@ -319,7 +319,7 @@ class WorldModel:
     def imagine(self, cameras: Sequence[Cameras], interactions: Sequence[Interactions]) -> Iterator[list[Observations]]:
         """Yield for each clip the frames of every agent along its cameras, none for an agent at the end of its path.
 
-        Nothing is in the way of a camera, with or without a body.
+        Nothing is in the way of a camera, with or without a body, and in a scene interactions change nothing.
 
         As long as all agents have one present frame and one memory, as those of ``branches`` do at first, the frame is
         encoded once and the memory is read once.

@@ -4,6 +4,9 @@ import pytest
 import torch
 
 from persist_cli.api.cells import CellOrigin
+from persist_cli.data.clips import interactions_of
+from persist_cli.rollout.camera_path import CameraPath
+from persist_cli.rollout.rollout import clips_along
 from persist_cli.rollout.world_model import Agent
 from tests.support.cell_rooms import BOX_CELLS, WALL, camera_at, cell_room
 from tests.support.drawn_scenes import DrawnWalls, empty_scene
@@ -45,6 +48,19 @@ def test_an_interaction_with_nothing_in_reach_is_refused_and_repeats_the_frame()
     _, result = walk(room_scene(), "right right right right right right toggle stay")
     assert result.free.tolist() == [True] * 6 + [False, True]
     assert torch.equal(result.seen.rgb[5], result.seen.rgb[6])
+
+
+@pytest.mark.parametrize("act", ["pick_up", "stay"])
+def test_along_given_poses_an_interaction_changes_no_scene_and_a_line_says_so(act, capsys):
+    world = scene_world(room_scene(), camera_at(cell_room(), *BEFORE_BOX, size=64))
+    agent, names = world.agents[0], ["stay", act]
+    interactions, cameras = interactions_of(names, agent.info.vocabulary), agent.cameras_after(names)
+    path = CameraPath(agent.now, cameras, interactions, tuple(names), agent.now, agent.info)
+    [[result]] = clips_along(world, [path])
+    grid = cell_room()
+    assert bool(agent.scene.cells.box(grid.corner, grid.shape).solid[BOX_CELLS].any())
+    assert len(result.seen) == 2
+    assert ("interactions do not change the scene" in capsys.readouterr().err) is (act == "pick_up")
 
 
 def test_in_a_branch_an_interaction_changes_its_own_scene_alone():
