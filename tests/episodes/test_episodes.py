@@ -33,6 +33,13 @@ def test_a_seed_gives_the_same_episodes_again(small_world: MiniWorld, found: lis
     assert len(found) >= 2
 
 
+def test_another_seed_gives_other_episodes(small_world: MiniWorld, found: list[Episode]) -> None:
+    search = replace(SEARCH, seed=SEARCH.seed + 1)
+    others = [episode for scene in find_episodes(small_world, [HOUSE], search) for episode in scene]
+    assert others
+    assert not {episode.start for episode in others} & {episode.start for episode in found}
+
+
 @pytest.mark.parametrize(("goals", "in_sight"), [("in-sight", True), ("hidden", False)])
 def test_goals_in_sight_or_hidden_alone_are_drawn_where_asked_for(
     small_world: MiniWorld, goals: str, in_sight: bool
