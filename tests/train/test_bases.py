@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
 import pytest
 
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.checkpoints.load import fresh_on_codec
+from persist_cli.plugins import make_settings
 from tests.support.micro_runs import stage
 
 
@@ -49,6 +51,17 @@ def test_a_fresh_video_model_on_a_codec_has_positions_of_its_own_size(codec):
     changes = {"transformer": {"use_rotary_positional_embeddings": True}}
     assert fresh_on_codec(base, changes).rotary_grid == (4, 4)
     assert fresh_on_codec(base, changes | {"rotary_grid": [8, 8]}).rotary_grid == (8, 8)
+
+
+def test_a_fresh_video_model_on_a_codec_has_the_usual_prompt_and_not_that_the_codec_has_none(codec, monkeypatch):
+    made = []
+    fresh = SimpleNamespace(load_codec=lambda folder: None)
+    monkeypatch.setattr("persist_cli.checkpoints.load.make_backbone", lambda name, own: made.append(own) or fresh)
+    base = find_checkpoint(codec)
+    assert base.settings["prompt"] is None  # its weights are in its place
+    for changes in ({"pretrained": "DIR"}, {"pretrained": "DIR", "prompt": "a walk"}):
+        fresh_on_codec(base, changes)
+    assert [make_settings("backbone", "cogvideox", own).prompt for own in made] == ["", "a walk"]
 
 
 @pytest.mark.parametrize("name", ["gradient_checkpointing", "compile"])

@@ -84,7 +84,7 @@ class CogVideoX(AdaptedBackbone):
     sharded_blocks = ("CogVideoXBlock", "MemoryBlock", "CanvasBlock")
     never_sharded = ("codec",)
     built_by = ("transformer", "prediction", "vae", "pretrained")
-    of_weights = ("rotary_grid",)
+    of_weights = ("rotary_grid", "prompt")
     video_model = ("transformer", WORLD)
     for_training = LOSS_SETTINGS
     settings: CogVideoXSettings
