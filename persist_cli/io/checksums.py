@@ -39,12 +39,17 @@ def is_verified(path: Path) -> bool:
 
 def tensor_checksum(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> str:
     """The checksum of a tensor file: over names, types, shapes and values of the tensors, and the metadata."""
+    return f"{CRC32}{_code(tensors, metadata):08x}"
+
+
+def _code(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> int:
+    """The CRC-32 behind ``tensor_checksum``."""
     rest = {key: value for key, value in metadata.items() if key != CHECKSUM}
     code = zlib.crc32(json.dumps(rest, sort_keys=True).encode())
     for name, tensor in sorted(tensors.items()):
         code = zlib.crc32(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode(), code)
         code = zlib.crc32(tensor_bytes(tensor), code)
-    return f"{CRC32}{code:08x}"
+    return code
 
 
 def with_row_checksums(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -52,8 +57,8 @@ def with_row_checksums(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     import torch
 
     rows = zip(*tensors.values(), strict=True)
-    texts = [tensor_checksum(dict(zip(tensors, row, strict=True)), {}) for row in rows]
-    return {**tensors, CHECKSUM: torch.tensor([int(text.removeprefix(CRC32), 16) for text in texts])}
+    codes = [_code(dict(zip(tensors, row, strict=True)), {}) for row in rows]
+    return {**tensors, CHECKSUM: torch.tensor(codes)}
 
 
 def is_whole(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> bool:

@@ -9,8 +9,6 @@ import numpy as np
 from persist_cli.errors import PersistError
 
 SEEDS: Final = 2**31  # of the sampling noise of an agent
-
-
 CLIPS: Final = 1_000_000  # more than a rollout has
 
 

@@ -31,7 +31,7 @@ from persist_cli.memorize.sources import Source
 from persist_cli.plugins import find_plugin
 from persist_cli.recipe import MemoryConfig, Recipe
 from persist_cli.train.feature_cache import FeatureCache
-from persist_cli.train.tensor_cache import TensorCache, cache_key
+from persist_cli.train.tensor_cache import ROWS, TensorCache, cache_key
 
 TOKENS: Final = 2  # format of memory tokens; those of 1 have neither colours nor origins and are not found
 
@@ -109,7 +109,7 @@ class CacheKeys:
             clip["view"] = frames.view.to_json()
         latents = tokens = memory = None
         if self.whole(frames):
-            latents = cache_key(clip | {"frames": "all", "rows": "frames"} | self.latents)
+            latents = cache_key(clip | {"frames": "all"} | ROWS | self.latents)
         elif self.repeats:
             latents = cache_key(clip | self.latents)
         if self.repeats and self.tokens is not None:

@@ -10,7 +10,7 @@ import torch
 from persist_cli.data.store import TrajectoryFile
 from persist_cli.memorize.kept_features import KeptFeatures, frame_digests
 from persist_cli.memorize.sources import Source
-from persist_cli.train.tensor_cache import TensorCache, cache_key
+from persist_cli.train.tensor_cache import ROWS, TensorCache, cache_key
 
 FRAMES: Final = "frames"  # the tensor of the frames' digests in an entry; another one has their features
 
@@ -35,7 +35,7 @@ class FeatureCache:
             file: the trajectory.
             frames: numbers of the frames; the first of a trajectory that are brought have all its frames encoded.
         """
-        key = cache_key({"trajectory": self.cache.hashes.of(file), "rows": "frames"} | self.depends)
+        key = cache_key({"trajectory": self.cache.hashes.of(file)} | ROWS | self.depends)
         digests = {frame: self._digests.get((key, frame), b"") for frame in frames}
         missing = [frame for frame, digest in digests.items() if digest not in self.encoder]
         self.encoder.renew(digests.values())  # the missing ones shall not take their place

@@ -24,6 +24,7 @@ from persist_cli.io.files import ASIDE, read_rows, read_tensors, remove_leftover
 from persist_cli.output.console import say
 
 FORMAT: Final = 3  # of the entries; those of another format are not found
+ROWS: Final = {"rows": "frames"}  # in the keys of ``put_rows``; entries without it have no checksum of each row
 
 SCANS: Final = 64  # how often at most the folder is measured while it fills up
 
