@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import signal
@@ -28,8 +29,10 @@ def run_that_blocks(arguments: list[str], begun: Path) -> None:
     """Begin a training that writes a file, and then waits outside Python as for another process."""
 
     def wait(*_):
-        begun.touch()
-        HashStore().wait(["never"], timedelta(hours=1))
+        while True:
+            with contextlib.suppress(KeyboardInterrupt):  # of a first signal that comes before the wait has begun
+                begun.touch()
+                HashStore().wait(["never"], timedelta(hours=1))
 
     finetune.finetune, signals.AGAIN = wait, 0
     run_command(arguments)
