@@ -89,9 +89,10 @@ from persist_cli.train.sources import (
     with_own_adapter,
 )
 from persist_cli.train.state import load_state
+from persist_cli.train.stopping import StopSignal, end_at_once
 from persist_cli.train.tensor_cache import CacheSettings
 from persist_cli.train.trainer import Trainer
-from persist_cli.train.training_loop import StopSignal, TrainingLoop, end_at_once
+from persist_cli.train.training_loop import TrainingLoop
 
 LONGEST_WAIT: Final = timedelta(hours=1)  # for a process that does not answer, as while it writes a large model
 

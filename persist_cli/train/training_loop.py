@@ -3,145 +3,34 @@
 from __future__ import annotations
 
 import math
-import multiprocessing
-import os
-import signal
-import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
-from dataclasses import dataclass
-from datetime import timedelta
-from multiprocessing import resource_tracker
 from pathlib import Path
-from types import FrameType
-from typing import Any, Final, Generic, TypeVar, cast
+from typing import Any, Generic, TypeVar, cast
 
 import torch
 from accelerate import Accelerator
 from torch import nn
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import Dataset
 
 from persist_cli.api.promises import check_losses, check_parameters
 from persist_cli.api.training_scenes import TrainingScenes
 from persist_cli.checkpoints.lineage import Lineage
 from persist_cli.data.clips import DistributedBatches
 from persist_cli.errors import PersistError
-from persist_cli.io.signals import STOPPING, caught_signals
 from persist_cli.output.console import add_task, progress
 from persist_cli.recipe import Recipe
 from persist_cli.train.distributed import Sharding, ZeroState, is_sharded, unflattened, uses_zero
 from persist_cli.train.log import StepLog, StepTimes
 from persist_cli.train.optimizer import Opponent, make_average, make_optimizer, set_learning_rate, update_average
-from persist_cli.train.packing import pack_shared, unpack
+from persist_cli.train.reading import explain_lost_readers, read_batches
 from persist_cli.train.state import TrainingState
+from persist_cli.train.stopping import StopSignal
 from persist_cli.training_settings import TrainingSettings
 
 Model = TypeVar("Model", bound=nn.Module)
-
-LONGEST_READ: Final = timedelta(minutes=30)  # of a batch; other processes wait longer, so that this is what is said
-
-
-@dataclass
-class StopSignal:
-    """The signal that asked a run to stop, once there is one; the run stops at the end of its step."""
-
-    signal: int | None = None
-
-    @classmethod
-    @contextmanager
-    def awaited(cls) -> Iterator[StopSignal]:
-        """Within the block a signal that would end the process is noted instead."""
-        stop = cls()
-
-        def note(number: int, _frame: FrameType | None) -> None:
-            stop.signal = number
-
-        with caught_signals(note):
-            yield stop
-
-
-def end_at_once(number: int) -> None:
-    """End this process by a signal as SIGKILL would, whatever it does; its run stays as its last checkpoint left it."""
-    try:
-        if os.environ.get("RANK", "0") == "0":
-            shown_cursor = "\033[?25h\n" if sys.stderr.isatty() else ""  # which a progress bar hides
-            line = "stopped at once; what was saved is whole, go on with --resume\n"
-            os.write(2, (shown_cursor + line).encode())  # no lock is waited for, as sys.stderr has one
-        for reader in multiprocessing.active_children():  # which would hold the lock of the run's folder for seconds
-            reader.kill()
-    finally:
-        os._exit(128 + number)
-
-
-def outlive_signals(_worker: int) -> None:
-    """Let a process that reads data go on when all processes get a signal: the run ends it, after its checkpoint."""
-    for number in STOPPING:
-        signal.signal(number, signal.SIG_IGN)
-
-
-@contextmanager
-def held_back_signals() -> Iterator[None]:
-    """Within the block signals that stop a run never reach processes that begin in it anew, without a fork.
-
-    The thread holds them back, and so do processes that it begins. These take seconds until ``outlive_signals`` runs in
-    them, and would end by a signal to all processes before. So they do on Windows still, which cannot hold one back.
-    """
-    if multiprocessing.get_start_method() == "fork" or not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    resource_tracker.ensure_running()  # when it begins, it lets signals through again
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-@contextmanager
-def explain_lost_readers() -> Iterator[None]:
-    """Replace torch's error about a process that reads data, and ended or does not answer, by one line.
-
-    Raises:
-        PersistError: that line.
-    """
-    try:
-        yield
-    except RuntimeError as error:
-        if not str(error).startswith("DataLoader "):
-            raise
-        raise PersistError(
-            f"a process that reads data was lost ({' '.join(str(error).split())}); check the free memory, and the disk "
-            "or server of the data; training.workers=0 reads without such processes"
-        ) from error
-
-
-def end_readers(batches: Any) -> None:
-    """End the processes of a loader's iterator; also one that hangs, for which the program would wait at its end."""
-    if hasattr(batches, "_shutdown_workers"):
-        batches._shutdown_workers()
-        for reader in batches._workers:
-            reader.kill()  # it outlives the signal that torch sends
-
-
-class CaughtErrors(Dataset[Any]):
-    """The samples of a data set; an error that the user can mend stands in the place of the sample that it is about.
-
-    Raised in a process that reads data, its one line would come back with that process's traceback.
-
-    Args:
-        dataset: the data set.
-    """
-
-    def __init__(self, dataset: Dataset[Any]) -> None:
-        self.dataset = dataset
-
-    def __getitem__(self, number: int) -> Any:
-        try:
-            return self.dataset[number]
-        except PersistError as error:
-            return error
 
 
 class TrainingLoop(ABC, Generic[Model]):
@@ -227,30 +116,13 @@ class TrainingLoop(ABC, Generic[Model]):
             self.state.step, settings.steps, settings.batch, settings.accumulation,
             self.accelerator.process_index, self.accelerator.num_processes,
         )  # fmt: skip
-        loader: DataLoader[Any] = DataLoader(
-            CaughtErrors(self.dataset),
-            batch_sampler=batches,
-            num_workers=settings.workers,
-            collate_fn=pack_shared if settings.workers else list,
-            timeout=LONGEST_READ.total_seconds() if settings.workers else 0,
-            worker_init_fn=outlive_signals,
-            generator=torch.Generator(),  # of its own: the loader must not draw from the run's random state
-        )
-        with held_back_signals() if settings.workers else nullcontext():
-            remaining = iter(loader)
-        try:
+        with closing(read_batches(self.dataset, batches, settings.workers)) as remaining:
             while True:
                 with self.times.part("data"):
-                    read = next(remaining, None)
-                    if read is None:
+                    samples = next(remaining, None)
+                    if samples is None:
                         return
-                    samples = unpack(read) if settings.workers else read
-                errors = [sample for sample in samples if isinstance(sample, PersistError)]
-                if errors:
-                    raise errors[0]
                 yield self.to_batch(samples)
-        finally:
-            end_readers(remaining)  # now, and not when the traceback of an error is forgotten
 
     def first_batches(self, count: int) -> Iterator[Any]:
         """So many batches of the first samples, of which something is measured before or after training."""

@@ -87,7 +87,7 @@ def hang(_clips, _number):
 def test_a_process_that_reads_data_no_more_ends_the_run(persist, walks, codec, tmp_path, monkeypatch, read):
     monkeypatch.setattr(ClipDataset, "__getitem__", read)
     if read is hang:
-        monkeypatch.setattr("persist_cli.train.training_loop.LONGEST_READ", timedelta(seconds=0.5))
+        monkeypatch.setattr("persist_cli.train.reading.LONGEST_READ", timedelta(seconds=0.5))
     monkeypatch.setattr(_utils, "MP_STATUS_CHECK_INTERVAL", 0.2)  # torch waits so long for a process to end
     ended = persist(*stage("stage1", walks, tmp_path / "run", f"base={codec}", READING))
     assert (ended.code, len(ended.err.splitlines())) == (1, 1), ended.err

@@ -11,7 +11,8 @@ from collections.abc import Iterator
 import pytest
 
 from persist_cli.io.signals import STOPPING
-from persist_cli.train.training_loop import StopSignal, held_back_signals
+from persist_cli.train.reading import held_back_signals
+from persist_cli.train.stopping import StopSignal
 from tests.support.micro_policies import policy_stage
 from tests.support.micro_runs import equal_runs, stage
 
