@@ -11,22 +11,7 @@ import pytest
 from persist_cli.errors import PluginError
 from persist_cli.plugins import list_plugins, load_plugin, plugin_errors
 from tests.support.micro_runs import stage
-from tests.support.packages import install
-
-LAST_FRAME = """
-    import torch
-    from persist_cli.api.memory import Memory
-    from persist_cli.api.tokens import MemoryTokens
-
-    class LastFrame(Memory):
-        frame = torch.zeros(0)
-        def write(self, observations): self.frame = self.encoder.encode(observations.rgb[-1:])[0].flatten(0, 1)
-        def read(self, cameras, budget):
-            features = self.frame[:budget].reshape(-1, self.encoder.channels)
-            return MemoryTokens.of(features, cameras.centers[:1].expand(len(features), 3))
-        def tensors(self): return {"frame": self.frame}
-        def restore(self, tensors): self.frame = tensors.get("frame", torch.zeros(0))
-"""
+from tests.support.packages import LAST_FRAME, install
 
 
 def test_a_memory_of_another_package_works_in_every_command_by_name(persist, site, walks, held_out, stage1, tmp_path):

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import platform
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -17,10 +16,11 @@ from persist_cli.checkpoints import lineage
 from persist_cli.checkpoints.load import adapter_memory
 from persist_cli.data.held_out import was_trained_on
 from persist_cli.evaluate.cases import Case
-from persist_cli.io.files import file_sha256, read_json
+from persist_cli.io.files import file_sha256, files_sha256, read_json
 from persist_cli.io.hub import cached_weight
 from persist_cli.memorize.imagining import scene_model_fingerprint
 from persist_cli.metrics.metric import Metric
+from persist_cli.plugin_code import code_of_others
 
 PACKAGES = ("accelerate", "diffusers", "numpy", "safetensors", "scipy", "torch", "torchmetrics", "transformers")
 
@@ -42,6 +42,8 @@ def environment(processes: int) -> dict[str, Any]:
 def checkpoint_json(checkpoint: Checkpoint) -> dict[str, Any]:
     """A checkpoint with the hashes of its base, recipes, adapters and their settings as JSON values."""
     adapters = {name: adapter_json(folder) for name, folder in checkpoint.adapters.items()}
+    code = {name: hashes["code"] for name, hashes in adapters.items() if "code" in hashes}
+    backbone = code_of_others(("backbone", checkpoint.backbone))
     return {
         "name": checkpoint.name,
         "path": str(checkpoint.folder),
@@ -49,14 +51,22 @@ def checkpoint_json(checkpoint: Checkpoint) -> dict[str, Any]:
         "recipe_sha256": recipe_sha256(checkpoint.folder),
         "adapters": {name: hashes["weights"] for name, hashes in adapters.items()},
         "adapter_settings": {name: hashes["settings"] for name, hashes in adapters.items()},
+        **({"code": backbone} if backbone else {}),
+        **({"adapter_code": code} if code else {}),
     }
 
 
-def adapter_json(folder: Path) -> dict[str, str]:
-    """The hashes of an adapter's weights and of its settings, among them the memory that it reads, as JSON values."""
+def adapter_json(folder: Path) -> dict[str, Any]:
+    """The hashes of an adapter's weights and of its settings, among them the memory that it reads, as JSON values.
+
+    Where memory or encoder are of another package, that of their code is there as well.
+    """
     files = list(folder.glob(f"*{WEIGHTS}"))
     weights = file_sha256(files[0]) if len(files) == 1 else files_sha256(folder, files)
-    return {"weights": weights, "settings": files_sha256(folder, folder.glob("*.json"))}
+    memory = read_json(folder / lineage.MEMORY_FILE)
+    code = code_of_others(("memory", memory["name"]), ("encoder", memory["encoder"]))
+    hashes = {"weights": weights, "settings": files_sha256(folder, folder.glob("*.json"))}
+    return hashes | ({"code": code} if code else {})
 
 
 def scene_models(checkpoints: Sequence[Checkpoint], memories: Sequence[str]) -> list[dict[str, str]]:
@@ -113,14 +123,6 @@ def recipe_sha256(folder: Path) -> str | None:
     home = folder / lineage.RECIPES
     recipes = list(home.rglob("*.yaml"))
     return files_sha256(home, recipes) if recipes else None
-
-
-def files_sha256(home: Path, paths: Iterable[Path]) -> str:
-    """SHA-256 over the names below ``home`` and the contents of some files."""
-    digest = hashlib.sha256()
-    for name, path in sorted((path.relative_to(home).as_posix(), path) for path in paths):
-        digest.update(name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
-    return digest.hexdigest()
 
 
 def metric_json(metrics: Mapping[str, Metric]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from typing import Any, Final
 from persist_cli.errors import PersistError
 
 # keys that earlier versions did not write, with the values that they stood for; None: they looked at no such thing
-ADDED: Final = {"adapter_settings": None, "autoguidance": (None, 1.0)}
+ADDED: Final = {"adapter_settings": None, "adapter_code": None, "code": None, "autoguidance": (None, 1.0)}
 MISSING: Final = object()  # equals no value, as None would
 
 

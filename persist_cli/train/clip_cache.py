@@ -28,6 +28,7 @@ from persist_cli.data.writing_noise import WritingNoise
 from persist_cli.memorize.factory import MemoryFactory, with_memory
 from persist_cli.memorize.kept_features import KeptFeatures
 from persist_cli.memorize.sources import Source
+from persist_cli.plugin_code import code_of_others
 from persist_cli.plugins import find_plugin
 from persist_cli.recipe import MemoryConfig, Recipe
 from persist_cli.train.feature_cache import FeatureCache
@@ -37,7 +38,9 @@ TOKENS: Final = 2  # format of memory tokens; those of 1 have neither colours no
 
 
 # what the features of a frame depend on, among all that tokens depend on
-FEATURES: Final = frozenset(("persist", "torch", "device", "encoder", "encoder_settings", "features", "packages"))
+FEATURES: Final = frozenset(
+    ("persist", "torch", "device", "encoder", "encoder_settings", "features", "packages", "code")
+)
 
 
 @dataclass(frozen=True)
@@ -305,6 +308,7 @@ def framewise_latents(video: Tensor) -> ClipLatents:
 def _token_dependencies(memory: MemoryConfig, factory: MemoryFactory, backbone: Backbone) -> dict[str, Any]:
     """The JSON values that memory tokens depend on; the features of a fixed picture stand for the encoder's weights."""
     plugins = [find_plugin("memory", memory.name), find_plugin("encoder", memory.encoder)]
+    code = code_of_others(*((plugin.kind, plugin.name) for plugin in plugins))
     return {
         "tokens": TOKENS,
         "memory": memory.name,
@@ -315,6 +319,7 @@ def _token_dependencies(memory: MemoryConfig, factory: MemoryFactory, backbone: 
         "budget": backbone.token_budget,
         **_imagined_by(factory),
         "packages": [[plugin.package, plugin.version] for plugin in plugins],
+        **({"code": code} if code else {}),
     }
 
 

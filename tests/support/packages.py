@@ -5,6 +5,21 @@ from __future__ import annotations
 import textwrap
 from pathlib import Path
 
+LAST_FRAME = """
+    import torch
+    from persist_cli.api.memory import Memory
+    from persist_cli.api.tokens import MemoryTokens
+
+    class LastFrame(Memory):
+        frame = torch.zeros(0)
+        def write(self, observations): self.frame = self.encoder.encode(observations.rgb[-1:])[0].flatten(0, 1)
+        def read(self, cameras, budget):
+            features = self.frame[:budget].reshape(-1, self.encoder.channels)
+            return MemoryTokens.of(features, cameras.centers[:1].expand(len(features), 3))
+        def tensors(self): return {"frame": self.frame}
+        def restore(self, tensors): self.frame = tensors.get("frame", torch.zeros(0))
+"""
+
 
 def install(folder: Path, package: str, group: str, target: str, code: str = "") -> None:
     """Install a distribution as pip does: a module and its metadata."""

@@ -32,6 +32,7 @@ from persist_cli.train.tensor_cache import STALE, CacheSettings, TensorCache, ca
 from persist_cli.training_settings import DataSettings, TrainingSettings
 from tests.support.disk import file_limit
 from tests.support.micro_runs import MICRO, MICRO_SETTINGS, SIZE, equal_runs, losses, stage
+from tests.support.packages import install
 from tests.support.processes import start_persist
 
 FEW = "data.clips_per_trajectory=3"
@@ -237,6 +238,16 @@ def test_another_version_of_a_plugin_changes_the_key_of_tokens(keys_of, monkeypa
     monkeypatch.setattr(clip_cache, "find_plugin", find)
     assert keys_of().latents == before.latents
     assert keys_of().tokens != before.tokens
+
+
+def test_an_edited_encoder_of_another_package_changes_the_key_of_tokens(keys_of, site):
+    code = "class Red(Encoder):\n    channels = 1\n    encode = lambda self, rgb: rgb[..., :1].float()\n"
+    code = f"from persist_cli.api.encoder import Encoder\n{code}"
+    install(site, "persist-red", "persist.encoders", "red = red_frames:Red", code)
+    before = keys_of(encoder="red", encoder_settings={})
+    (site / "red_frames.py").write_text(f"{code}# a change\n")
+    after = keys_of(encoder="red", encoder_settings={})
+    assert (after.latents, after.tokens == before.tokens) == (before.latents, False)
 
 
 def test_another_format_of_tokens_changes_their_key_and_not_that_of_latents(keys_of, monkeypatch):

@@ -24,6 +24,7 @@ from persist_cli.policies.open_policy import open_policy
 from tests.conftest import CommandResult, Persist
 from tests.support.micro_runs import run_persist
 from tests.support.miniworlds import make_world
+from tests.support.packages import install
 from tests.support.predictions import cache_random
 from tests.support.processes import run_command, run_in_pair
 from tests.support.small_house import SETTINGS, as_set, episodes_in
@@ -181,6 +182,16 @@ def test_rows_can_be_added_but_other_settings_are_refused(bench: Bench) -> None:
     refused = bench(*options, "--rows", "random", "--horizon", 5)
     assert refused.code == 1
     assert "holds another benchmark (planning horizon: 8, now 5)" in refused.err
+
+
+def test_a_benchmark_does_not_go_on_with_an_edited_cost_of_another_package(bench: Bench, site: Path) -> None:
+    code = "from persist_cli.costs.places import DistanceCost\nclass Air(DistanceCost): pass\n"
+    install(site, "persist-air", "persist.costs", "air = air_line:Air", code)
+    options = ("--cost", "air", "--loops", "closed", "--patience", 1, "--rows", "random")
+    assert [bench(*options).code, bench(*options).code] == [0, 0]
+    (site / "air_line.py").write_text(code + "# a change\n")
+    refused = bench(*options)
+    assert (refused.code, "holds another benchmark (code cost air: persist-air 1.2, c" in refused.err) == (1, True)
 
 
 def test_a_file_of_episodes_is_known_by_what_it_holds_whatever_a_later_persist_adds(

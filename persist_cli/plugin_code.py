@@ -1,0 +1,54 @@
+"""The code of plugins of other packages: what one measured or computed is not of its code after a change."""
+
+from __future__ import annotations
+
+import importlib.util
+from importlib.machinery import EXTENSION_SUFFIXES, SOURCE_SUFFIXES
+from pathlib import Path
+from typing import Final
+
+from persist_cli.errors import PluginError
+from persist_cli.io.files import files_sha256
+from persist_cli.plugins import OWN, find_plugin
+
+SHOWN: Final = 12  # digits of a hash
+
+
+def code_of(kind: str, name: str) -> str | None:
+    """Package, version and a hash of the code of a plugin; ``None`` for one of persist's own.
+
+    All modules count of the outermost package that is no namespace, since the plugin may import any of them. A plugin
+    that is edited in place keeps its version, and is another one by its hash.
+
+    Args:
+        kind: a key of ``persist_cli.plugins.KINDS``.
+        name: the name that users choose it by; it need not be installed.
+    """
+    try:
+        plugin = find_plugin(kind, name)
+    except PluginError:
+        return "not installed"
+    if plugin.module in OWN:
+        return None
+    code = files_sha256(*_sources(plugin.target.partition(":")[0]))
+    return f"{plugin.package} {plugin.version}, code {code[:SHOWN]}"
+
+
+def code_of_others(*plugins: tuple[str, str]) -> dict[str, str]:
+    """What ``code_of`` says of those of these plugins, by kind and name, that are not persist's own."""
+    found = {f"{kind} {name}": code_of(kind, name) for kind, name in plugins}
+    return {plugin: code for plugin, code in found.items() if code is not None}
+
+
+def _sources(module: str) -> tuple[Path, list[Path]]:
+    """The folder of a module's outermost package, and its files; or the module's own file. Nothing is imported."""
+    names = module.split(".")
+    for end in range(1, len(names) + 1):
+        spec = importlib.util.find_spec(".".join(names[:end]))
+        if spec is None or not spec.has_location or spec.origin is None:  # a namespace, which other packages share
+            continue
+        home, file = Path(spec.origin).parent, Path(spec.origin)
+        return home, [file] if spec.submodule_search_locations is None else [
+            path for path in home.rglob("*.*") if path.name.endswith((*SOURCE_SUFFIXES, *EXTENSION_SUFFIXES))
+        ]
+    return Path(), []
