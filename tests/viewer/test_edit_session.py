@@ -176,6 +176,15 @@ def test_the_selection_goes_along_with_what_is_moved(session):
     assert session.selection[0].box.low[0] == pytest.approx(before.low[0] + 0.5)
 
 
+@pytest.mark.parametrize("metres", [-0.15, -0.3])
+def test_a_thing_stays_whole_and_selected_however_often_it_moves_by_less_or_more_than_a_cell(session, metres):
+    session.select_thing("table#1")
+    for _ in range(3):
+        session.shift(along(session, metres))
+    assert [one.name for one in session.selection] == ["table#1"]
+    assert {thing.name: len(thing.cells) for thing in session.things} == {"table#1": 18, "box#1": 1}
+
+
 def test_an_edit_that_cannot_be_done_changes_nothing(session):
     session.select_thing("table#1")
     session.paint((0, 0, 255))
