@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from persist_cli.api.cells import FREE, OUTSIDE, SOLID, CellOrigin
-from persist_cli.api.geometry import camera_rays, project
+from persist_cli.api.geometry import camera_rays, project, unproject
 from persist_cli.api.ground import ground_axes
 from persist_cli.api.memory import FrameOfReference
 from persist_cli.api.observations import Origin
@@ -15,9 +15,9 @@ from persist_cli.errors import CheckpointError, DataError, PersistError
 from persist_cli.memorize.memory_file import load_memory
 from persist_cli.plugins import make_encoder, make_memory
 from persist_memory.scene import cell_store
-from persist_memory.scene.fusion import NEAR, Votes, votes_of
+from persist_memory.scene.fusion import NEAR, Votes, _thinned, votes_of
 from persist_memory.scene.grid_scene import GridScene
-from tests.support.cell_rooms import FORM, TABLE_CELLS, camera_at, cell_room
+from tests.support.cell_rooms import COLORS, FORM, TABLE, TABLE_CELLS, camera_at, cell_room
 from tests.support.room_views import observe, room_walk
 from tests.support.rooms import FURNITURE, ROOM, UP, look
 
@@ -90,6 +90,13 @@ def test_a_grazing_look_over_the_floor_frees_none_of_its_cells():
     floor = -grid.corner[2]
     assert int((grid.solid[:, :, floor]).sum()) > 10
     assert not bool((grid.known & ~grid.solid)[:, :, floor].any())
+
+
+def test_the_cell_of_a_camera_is_free():
+    grid = scene(observe([look((0.0, 1.3, 0.0), 20.0, -10.0)])).cells
+    place = tuple((grid.numbers(torch.tensor([0.0, 1.3, 0.0])) - torch.tensor(grid.corner)).tolist())
+    assert bool(grid.known[place])
+    assert int(grid.classes[place]) == FREE
 
 
 def test_a_cell_has_the_mean_colour_of_its_pixels():
@@ -216,6 +223,18 @@ def test_given_cells_count_as_observed_and_one_frame_does_not_change_them():
     assert torch.equal(after.classes, before.classes)
 
 
+def test_one_frame_neither_fills_a_given_free_cell_nor_paints_a_given_thing():
+    store = cell_store.CellStore(named_scene().cells)
+    store.put(cell_room())
+    free, table = (6, 3, 4), (4, 6, 1)
+    white = torch.tensor([[255, 255, 255, 1]]).expand(2, 4)
+    hit = torch.tensor([free, table]) + torch.tensor(cell_room().corner)
+    store.observe([Votes(hit, white, torch.zeros(0, 3).long())])
+    after = store.known()
+    assert int(after.classes[free]) == FREE
+    assert (after.colors[table].int() - torch.tensor(COLORS[TABLE])).abs().max() < 5
+
+
 @pytest.mark.parametrize("change", [{"size": 0.5}, {"palette": ("free", "solid", "outside")}])
 def test_cells_of_another_size_or_palette_are_refused_in_one_line(change):
     memory, grid = named_scene(), cell_room()
@@ -303,6 +322,29 @@ def test_settings_are_finite(name, value):
         scene(**{name: value})
 
 
+def test_the_bounds_of_a_scene_reach_to_the_borders_of_its_cells():
+    memory = named_scene()
+    memory.add(cell_room())
+    low, high = memory.figures().bounds
+    assert (low[1], high[1]) == pytest.approx((-0.125, 2.875))
+    assert [b - a for a, b in zip(low, high, strict=True)] == pytest.approx([3.5, 3.0, 3.5])
+
+
+def test_a_scene_that_was_looked_at_shows_what_is_restored_into_it():
+    memory, more = scene(room_walk(1)), scene(room_walk(6))
+    assert memory.figures().cells < more.figures().cells
+    memory.restore(more.tensors())
+    assert memory.figures().cells == more.figures().cells
+
+
+def test_a_merged_scene_keeps_its_own_view_and_one_without_takes_that_of_the_other():
+    frames = room_walk(2)
+    own, empty, other = scene(frames[:1]), scene(), scene(frames[1:])
+    for memory, view in ((own, 0), (empty, 1)):
+        memory.merge(other)
+        assert torch.equal(memory.tensors()["view.rgb"], frames.rgb[view])
+
+
 def test_a_map_shows_solid_cells_with_their_origins():
     memory = named_scene()
     grid = cell_room()
@@ -312,6 +354,7 @@ def test_a_map_shows_solid_cells_with_their_origins():
     assert len(points.positions) == int(grid.solid.sum())
     assert set(points.origins.tolist()) == {CellOrigin.OBSERVED, CellOrigin.EDITED}
     assert memory.figures().cells == grid.known.numel()
+    assert memory.figures().imagined == 0
 
 
 def test_a_copy_is_independent():
@@ -329,6 +372,15 @@ def test_a_cell_that_as_many_frames_saw_as_saw_past_is_solid_and_free_after_one_
     assert store.known().classes.tolist() == [[[SOLID]]]
     store.observe([Votes(none, torch.zeros(0, 4).long(), cell)])
     assert store.known().classes.tolist() == [[[FREE]]]
+
+
+def test_the_pixels_that_are_read_of_a_large_image_see_what_they_saw_in_it():
+    frame = observe([look((0.0, 1.3, 0.0), 10.0, 0.0)], 384, 384)
+    read = _thinned(frame)
+    kept = slice(1, None, 3)
+    assert torch.equal(read.rgb, frame.rgb[:, kept, kept])
+    there = unproject(frame.depth, frame.cameras)[:, kept, kept]
+    assert torch.allclose(unproject(read.depth, read.cameras), there, atol=1e-5)
 
 
 def test_only_cells_whose_middle_a_ray_comes_near_are_freed():

@@ -8,7 +8,7 @@ import torch
 
 from persist_cli.api.cell_rays import first_surfaces, sheet_cells
 from persist_cli.api.cell_things import find_things, floor_level, structure
-from persist_cli.api.cells import FREE, SOLID, CellGrid, CellOrigin
+from persist_cli.api.cells import FREE, OUTSIDE, SOLID, CellGrid, CellOrigin
 from persist_cli.api.observations import Observations
 from persist_cli.api.scene_edits import Copy, Edit, Insert, Move, Paint, Remove
 from persist_cli.errors import DataError
@@ -55,6 +55,14 @@ def test_the_floor_under_a_removed_thing_gets_the_class_and_colour_of_the_floor_
     gone = edited(grid, Remove(**box_of(grid, "table#1")))
     assert bool((gone.classes[1:-1, 1:-1, 0] == FLOOR).all())
     assert bool((gone.colors[1:-1, 1:-1, 0] == torch.tensor(COLORS[FLOOR], dtype=torch.uint8)).all())
+
+
+def test_a_floor_that_was_seen_under_a_removed_thing_stays_as_it_was_seen():
+    grid = cell_room()
+    grid.colors[4, 7, 0] = 7
+    gone = edited(grid, Remove(**box_of(grid, "table#1")))
+    assert gone.colors[4, 7, 0].tolist() == [7, 7, 7]
+    assert bool((gone.origins[:, :, 0] == CellOrigin.OBSERVED).all())
 
 
 def test_a_box_around_a_thing_and_the_wall_behind_takes_the_thing_alone():
@@ -148,6 +156,17 @@ def test_an_edit_with_a_model_leaves_every_observed_cell_with_its_votes_and_its_
     assert bool((votes["hits"] + votes["passes"] > 0)[observed].all())
 
 
+def test_a_model_fills_what_an_edit_uncovers_and_nothing_else():
+    scene, grid = empty_scene(DrawnWalls()), cell_room()
+    behind, elsewhere = (slice(4, 6), slice(9, 12), slice(1, 4)), (slice(10, 12), slice(9, 11), slice(6, 8))
+    grid.origins[behind] = grid.origins[elsewhere] = 0
+    scene.add(grid)
+    scene.edit([Remove(**box_of(grid, "table#1"))])
+    known = scene.cells.box(grid.corner, grid.shape).known
+    assert bool(known[behind].any())
+    assert not bool(known[elsewhere].any())
+
+
 def test_an_edited_scene_merged_with_its_own_copy_keeps_what_is_solid():
     scene = observed_scene()
     box = find_things(scene.cells)[-1].box
@@ -194,12 +213,14 @@ def test_the_outcome_says_who_filled_what_was_uncovered():
 def test_things_of_no_known_class_are_removed_and_walls_stay():
     grid = cell_room()
     grid.classes[grid.solid] = SOLID
+    grid.colors[4:6, 6:9, 0] = 7  # what was seen of the floor below the table
     assert floor_level(grid) == 0
     assert bool(structure(grid)[0, 3, 4])
     assert not bool(structure(grid)[TABLE_CELLS].any())
     gone = edited(grid, Remove(low=(0.3, 0.0, -0.9), high=(0.9, 1.0, 2.0)))
     assert not bool(gone.solid[TABLE_CELLS].any())
     assert bool(gone.solid[:, :, 0].all())
+    assert gone.colors[4:6, 6:9, 0].unique(dim=0).unique(dim=1).tolist() == [[list(COLORS[FLOOR])]]
 
 
 def test_paint_gives_all_in_a_box_one_colour_and_changes_no_class():
@@ -248,6 +269,13 @@ def test_what_stands_on_a_removed_thing_falls_on_the_floor():
     assert gone.colors[4, 7, 1].tolist() == [7, 7, 7]
 
 
+def test_what_falls_is_let_down_whole_however_high_it_is():
+    grid = with_box_on_table()
+    grid.classes[4, 7, 5] = BOX
+    gone = edited(grid, Remove(**box_of(grid, "table#1")))
+    assert (gone.classes[4, 7] == BOX).nonzero()[:, 0].tolist() == [1, 2]
+
+
 def test_what_stands_on_something_else_too_stays():
     grid = with_box_on_table()
     grid.classes[4:6, 5:7, 4] = BOX
@@ -260,6 +288,9 @@ def test_a_copy_stands_at_both_places():
     grid = cell_room()
     copied = edited(grid, Copy(**box_of(grid, "box#1"), by=(0.0, 0.0, -1.0)))
     assert [thing.name for thing in find_things(copied)] == ["table#1", "box#1", "box#2"]
+    laden = with_box_on_table()
+    twice = edited(laden, Copy(**box_of(laden, "table#1"), by=(1.0, 0.0, 0.0)))
+    assert [thing.name for thing in find_things(twice)] == ["table#1", "table#2", "box#1", "box#2"]  # one lay on it
 
 
 def test_an_inserted_thing_rests_on_what_is_below_and_is_as_large_as_the_scenes_own():
@@ -270,6 +301,32 @@ def test_an_inserted_thing_rests_on_what_is_below_and_is_as_large_as_the_scenes_
     assert max(thing.box.low[1] for thing in boxes) == pytest.approx(0.875)
     assert all(len(thing.cells) == 1 for thing in boxes)
     assert [len(thing.cells) for thing in find_things(room) if thing.kind == "table"] == [18, 18]
+
+
+def above(grid: CellGrid, first: int, second: int) -> tuple[float, None, float]:
+    """A place over a cell of the floor whose height is left open."""
+    x, _, z = grid.centers()[first, second, 0].tolist()
+    return x, None, z
+
+
+def test_an_inserted_thing_is_like_most_of_the_scenes_own_but_a_table_is_not_lower_than_usual():
+    grid = cell_room()
+    grid.classes[2, 11, 1] = grid.classes[7:10, 11, 1] = BOX
+    grid.colors[2, 11, 1] = torch.tensor(COLORS[BOX], dtype=torch.uint8)
+    grid.classes[4:6, 6:9, 2:4] = FREE
+    room = edited(grid, Insert(kind="box", at=above(grid, 6, 3)), Insert(kind="table", at=above(grid, 9, 8)))
+    assert int((room.classes == BOX).sum()) == int((grid.classes == BOX).sum()) + 1
+    assert room.colors[6, 3, 1].tolist() == list(COLORS[BOX])
+    assert (room.classes[9, 8] == TABLE).nonzero()[:, 0].tolist() == [1, 2, 3]
+    grid.classes[4:6, 6:9, 1:5] = TABLE
+    high = edited(grid, Insert(kind="table", at=above(grid, 9, 8)))
+    assert (high.classes[9, 8] == TABLE).nonzero()[:, 0].tolist() == [1, 2, 3, 4]
+
+
+def test_an_inserted_thing_stands_at_the_height_of_the_floor_where_nobody_saw_it():
+    grid = cell_room()
+    grid.origins[6, 3, 0] = 0
+    assert int(edited(grid, Insert(kind="box", at=above(grid, 6, 3))).classes[6, 3, 1]) == BOX
 
 
 def test_an_inserted_thing_stands_at_the_height_and_has_the_size_and_colour_that_are_asked_for():
@@ -337,6 +394,16 @@ def test_the_surroundings_guess_every_cell_and_close_walls_but_not_doorways():
     assert bool(guessed.known.all())
     assert bool((guessed.classes[6:8, 0, 1:8] == FREE).all())
     assert bool((guessed.classes[3:5, 0, 1:8] == WALL).all())
+
+
+def test_a_floor_goes_on_as_the_nearest_floor_and_what_is_below_cells_outside_is_outside():
+    grid = cell_room()
+    grid.classes[4:9, 5:7, 0] = BOX
+    grid.classes[0, 0, 9:] = OUTSIDE
+    grid.origins[4:9, 7:9, 0] = grid.origins[0, 0, 1:9] = 0
+    guessed = guess(grid)
+    assert bool((guessed.classes[4:9, 7:9, 0] == FLOOR).all())
+    assert bool((guessed.classes[0, 0, 1:9] == OUTSIDE).all())
 
 
 def test_where_a_thing_hid_the_floor_behind_it_up_to_the_wall_the_view_has_no_hole():

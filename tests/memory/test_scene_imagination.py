@@ -9,7 +9,7 @@ from persist_cli.api.scene_model import SceneForm
 from persist_cli.errors import CheckpointError, DataError
 from persist_cli.memorize.memory_file import load_memory
 from persist_memory.scene import grid_scene
-from persist_memory.scene.imagination import sees_unknown
+from persist_memory.scene.imagination import View, resized, sees_unknown, windows_over
 from tests.support.cell_rooms import FORM, WALL, camera_at, cell_room
 from tests.support.drawn_scenes import SHAPE, DrawnWalls, empty_scene
 from tests.support.room_views import observe, room_walk
@@ -46,6 +46,7 @@ def test_completing_fills_the_window_and_keeps_every_known_cell():
     window = scene.cells.box((-8, -8, 0), SHAPE)  # around the camera, which stands over the origin
     assert bool(window.known.all())
     assert bool((window.classes[window.origins == CellOrigin.OBSERVED] != SOLID).all())
+    assert int(window.colors[~window.solid].max()) == 0  # what is free has no colour, whatever the model paints
 
 
 def test_a_seed_gives_the_same_place_and_another_seed_another_one():
@@ -76,6 +77,46 @@ def test_a_region_larger_than_a_window_is_completed_by_several():
     inside = region.contains(scene.cells.centers())
     assert int(inside.sum()) > SHAPE[0] * SHAPE[1] * 4
     assert bool(scene.cells.known[inside & (scene.cells.centers()[..., 1] > -0.1)].all())
+
+
+def test_only_what_lies_in_a_region_gets_a_class():
+    scene = seen()
+    before, solid = scene.cells, scene.cells.centers()[scene.cells.solid]
+    region = Box(tuple(solid.amin(0).tolist()), tuple(solid.median(0).values.tolist()))
+    scene.complete(region)
+    inside, classes = region.contains(before.centers()) & before.solid, contents(scene, before)[0]
+    assert int(inside.sum()) > 5 < int((before.solid & ~inside).sum())
+    assert bool((classes[inside] == WALL).all())
+    assert bool((classes[before.solid & ~inside] == SOLID).all())
+
+
+def test_another_seed_imagines_a_region_otherwise():
+    region, scenes = Box((3.0, 0.0, -1.0), (3.9, 1.4, 0.4)), (seen(), seen(), seen())
+    for scene, seed in zip(scenes, (3, 3, 4), strict=True):
+        scene.complete(region, seed)
+    first, again, other = (contents(scene, scenes[0].cells)[0] for scene in scenes)
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+
+
+def test_a_large_region_is_completed_from_the_newest_camera_on(monkeypatch):
+    scene, centers = seen(), []
+    monkeypatch.setattr(grid_scene, "windows_over", lambda low, high, form, center: centers.append(center) or [])
+    scene.complete(Box((-9.0, 0.0, -9.0), (1.0, 2.0, 9.0)))
+    assert centers == [scene.cells.numbers(torch.tensor([0.0, 1.3, 0.0])).tolist()]
+
+
+def test_windows_lie_around_a_small_piece_and_over_a_large_one_half_by_half_the_nearest_first():
+    form = SceneForm(FORM, SHAPE)
+    assert windows_over([3, 0], [11, 16], form, (0, 0)) == [(-1, 0)]
+    assert windows_over([0, 0], [40, 16], form, (14, 8)) == [(8, 0), (0, 0), (16, 0), (24, 0)]
+
+
+def test_windows_begin_at_the_height_of_the_floor():
+    scene = seen(floor=-1.0)
+    scene.complete()
+    imagined = scene.cells.centers()[scene.cells.origins == CellOrigin.IMAGINED]
+    assert float(imagined[:, 1].min()) == -1.0
 
 
 def test_an_observation_replaces_what_was_imagined_and_an_edit_stays():
@@ -111,6 +152,13 @@ def test_what_a_path_will_see_is_imagined_once_and_always_the_same():
     assert torch.equal(grown.classes, again.cells.classes)
 
 
+def test_what_is_imagined_on_the_way_depends_on_the_seed_of_the_settings():
+    scene, other = seen(foresight=3.0), seen(foresight=3.0, seed=1)
+    for one in (scene, other):
+        one.foresee([room_walk(4).cameras])
+    assert not torch.equal(scene.cells.classes, contents(other, scene.cells)[0])
+
+
 def test_rays_look_for_the_unknown_once_from_a_camera_until_the_cells_change(monkeypatch):
     scene, looked = empty_scene(DrawnWalls()), []
     scene.add(cell_room())
@@ -135,6 +183,16 @@ def test_the_unknown_in_which_a_camera_stands_is_imagined_though_nothing_else_is
     scene.add(room)
     scene.foresee([camera_at(room, (2, 3, 5), (9, 8, 2))])
     assert int((scene.cells.origins == CellOrigin.IMAGINED).sum()) > 500
+
+
+@pytest.mark.parametrize(("foresight", "imagines"), [(1.0, False), (5.0, True)])
+def test_what_is_unknown_farther_away_than_is_foreseen_is_not_imagined(foresight, imagines):
+    room, scene = cell_room(), empty_scene(DrawnWalls(), foresight=foresight)
+    room.origins[8, 3:9, 1:8] = 0  # 1.4 m ahead
+    scene.add(room)
+    before = scene.cells
+    scene.foresee([camera_at(room, (2, 5, 5), (8, 5, 5))])
+    assert (scene.cells is not before) == imagines
 
 
 def test_nothing_is_imagined_where_all_that_is_seen_is_known_or_there_is_no_model():
@@ -162,6 +220,13 @@ def test_the_model_is_told_of_the_newest_view_unless_it_shows_another_place():
     painted = [one.cells.colors[(one.cells.origins == CellOrigin.IMAGINED) & one.cells.solid] for one in (near, far)]
     assert len(set(map(tuple, painted[0].tolist()))) == 1
     assert int(painted[0].min()) > 0 == int(painted[1].max())
+
+
+def test_a_view_is_made_smaller_without_depths_between_two_surfaces():
+    frame = observe([look((0.0, 1.3, 0.0), 20.0, -10.0)], 64, 64)
+    view = resized(View(frame.rgb[0], frame.depth[0], frame.cameras[0]), 16, 16)
+    assert view.rgb.shape == (16, 16, 3)
+    assert bool(torch.isin(view.depth, frame.depth).all())
 
 
 def test_a_completed_scene_is_saved_and_loaded_with_its_origins(tmp_path):

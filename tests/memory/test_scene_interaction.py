@@ -10,7 +10,8 @@ from persist_cli.api.scene_edits import Remove
 from persist_cli.api.scene_model import Given
 from persist_cli.errors import CheckpointError
 from persist_cli.memorize.memory_file import load_memory
-from tests.support.cell_rooms import BOX, BOX_CELLS, COLORS, FLOOR, FORM, WALL, camera_at, cell_room
+from persist_memory.scene.interaction import Load
+from tests.support.cell_rooms import BOX, BOX_CELLS, COLORS, FLOOR, FORM, TABLE, TABLE_CELLS, WALL, camera_at, cell_room
 from tests.support.drawn_scenes import DrawnWalls, empty_scene
 from tests.support.scene_worlds import rendering
 
@@ -36,13 +37,17 @@ def classes(scene):
     return scene.cells.box(grid.corner, grid.shape).classes
 
 
+def origins(scene):
+    grid = cell_room()
+    return scene.cells.box(grid.corner, grid.shape).origins
+
+
 def test_a_thing_ahead_is_picked_up_and_leaves_free_cells_that_count_as_imagined():
     scene = furnished()
     assert do(scene, "pick_up")
     assert int(classes(scene)[BOX_CELLS]) == FREE
-    origins = scene.cells.box(cell_room().corner, cell_room().shape).origins
-    assert int(origins[BOX_CELLS]) == CellOrigin.IMAGINED
-    assert int((origins == CellOrigin.IMAGINED).sum()) == 1
+    assert int(origins(scene)[BOX_CELLS]) == CellOrigin.IMAGINED
+    assert int((origins(scene) == CellOrigin.IMAGINED).sum()) == 1
     assert not do(scene, "pick_up", BEFORE_TABLE)  # the hands are full
 
 
@@ -57,7 +62,61 @@ def test_what_was_picked_up_is_put_down_elsewhere_in_its_colour(tmp_path):
     assert 7 <= place[0] <= 8
     colors = loaded.cells.box(cell_room().corner, cell_room().shape).colors
     assert colors[tuple(place)].tolist() == cell_room().colors[BOX_CELLS].flatten().tolist()
+    assert int(origins(loaded)[tuple(place)]) == CellOrigin.IMAGINED
     assert not do(loaded, "drop")
+
+
+def test_a_copy_has_the_same_thing_in_its_hands():
+    scene = furnished()
+    do(scene, "pick_up")
+    assert all(do(one, "drop", ((5, 9, 5), (9, 9, 5))) for one in (scene.copy(), scene))
+
+
+def test_a_merged_scene_keeps_its_own_thing_in_its_hands_and_empty_ones_take_that_of_the_other():
+    own, empty, other, grid = furnished(), furnished(), empty_scene(), cell_room()
+    grid.classes[BOX_CELLS] = FORM.palette.index("barrel")
+    other.add(grid)
+    for scene in (own, other):
+        assert do(scene, "pick_up")
+    for scene in (own, empty):
+        scene.merge(other)
+    carried = [scene.tensors()["carried.classes"].tolist() for scene in (own, empty)]
+    assert carried == [[BOX], [FORM.palette.index("barrel")]]
+
+
+def test_a_restored_scene_has_neither_the_view_nor_the_thing_in_the_hands_from_before():
+    scene, other = furnished(), furnished()
+    scene.write(rendering(scene.cells, camera_at(cell_room(), *BEFORE_BOX)))
+    do(scene, "pick_up")
+    scene.restore(other.tensors())
+    assert scene.tensors().keys() == other.tensors().keys()
+
+
+def test_a_wide_thing_is_reached_from_its_rim_and_put_down_clear_of_the_body():
+    scene, grid = furnished(), cell_room()
+    grid.classes[TABLE_CELLS] = FREE
+    grid.classes[8:11, 3:6, 1:2] = TABLE
+    scene.add(grid)
+    assert do(scene, "pick_up", ((2, 4, 5), (9, 4, 5)))  # 1.75 m to its middle
+    assert do(scene, "drop", ((3, 9, 5), (12, 9, 5)))
+    cells = (classes(scene) == TABLE).nonzero()
+    assert (len(cells), cells[:, 2].unique().tolist()) == (9, [1])
+    assert (int(cells[:, 0].amin()) - 3 - 0.5) * FORM.size > Body().radius
+
+
+def test_what_is_carried_has_the_mean_of_its_colours():
+    colors = torch.tensor([[10, 200, 0], [20, 100, 255]], dtype=torch.uint8)
+    load = Load(torch.tensor([[0, 0, 0], [0, 0, 1]]), torch.tensor([BOX, BOX], dtype=torch.uint8), colors)
+    assert load.color.tolist() == [15, 150, 128]
+
+
+def test_where_no_floor_is_known_a_thing_is_put_down_as_low_as_the_feet_of_the_agent():
+    scene, grid = empty_scene(), cell_room()
+    grid.origins[:, :, 0] = 0
+    scene.add(grid)
+    assert do(scene, "pick_up")
+    assert do(scene, "drop", ((5, 9, 5), (9, 9, 5)))
+    assert (classes(scene) == BOX).nonzero()[:, 2].tolist() == [1]
 
 
 def test_nothing_is_put_down_into_a_wall():
@@ -98,6 +157,7 @@ def test_toggling_turns_the_colour_of_a_box_into_its_complement_and_back():
 
     assert do(scene, "toggle")
     assert torch.equal(now(), 255 - color)
+    assert int(origins(scene)[BOX_CELLS]) == CellOrigin.IMAGINED
     assert do(scene, "toggle")
     assert torch.equal(now(), color)
     assert not do(scene, "toggle", BEFORE_TABLE)  # a table cannot be toggled
@@ -130,6 +190,10 @@ def test_a_thing_behind_another_and_one_that_is_too_large_stay():
     assert not do(hidden, "pick_up")
     assert not do(furnished(carries=0.5), "pick_up", BEFORE_TABLE)
     assert do(furnished(), "pick_up", BEFORE_TABLE)
+    tall, grid = furnished(), cell_room()
+    grid.classes[9, 4, 1:6] = BOX
+    tall.add(grid)
+    assert not do(tall, "pick_up", ((5, 4, 9), (9, 4, 9)))
 
 
 def test_without_classes_a_small_thing_that_stands_alone_is_picked_up():
@@ -161,6 +225,7 @@ def test_a_model_can_say_what_becomes_of_things():
     scene = furnished(DrawnWalls(), evolution="model")
     assert do(scene, "pick_up")
     assert int(classes(scene)[BOX_CELLS]) == FREE
+    assert int(scene.cells.colors[~scene.cells.solid].max()) == 0
     assert "carried.cells" in scene.tensors()
     assert not do(scene, "toggle")  # of which this model says nothing
     with pytest.raises(CheckpointError, match="--model"):
@@ -177,6 +242,41 @@ def test_a_model_is_not_asked_to_pick_up_with_full_hands_or_to_drop_with_empty_o
     assert int(classes(scene)[2, 4, 1]) == BOX
 
 
+def test_a_model_is_told_what_is_carried_and_draws_by_seed_and_steps_of_the_settings():
+    class Dropping(DrawnWalls):
+        """Puts the carried thing into a free cell in reach."""
+
+        def sample(self, samples, steps):
+            told.append((int(samples.carried), samples.carried_color[0].tolist(), int(samples.seeds), steps))
+            classes, colors = super().sample(samples, steps)
+            if int(samples.action) == 2:
+                classes[tuple(((samples.given == Given.PAST) & (classes == FREE)).nonzero()[0])] = BOX
+            return classes, colors
+
+    told, seeds = [], []
+    for seed in (1, 2):
+        scene = furnished(Dropping(), evolution="model", seed=seed, steps=7)
+        assert do(scene, "pick_up")
+        assert do(scene, "drop")
+        assert "carried.cells" not in scene.tensors()
+        seeds += [told[-2][2], told[-1][2]]
+    assert [(kind, color) for kind, color, _, _ in told[:2]] == [(0, [0, 0, 0]), (BOX, list(COLORS[BOX]))]
+    assert {steps for *_, steps in told} == {7}
+    assert seeds[0] != seeds[2]
+
+
+def test_what_a_model_says_of_unknown_cells_in_reach_is_not_taken():
+    class Walling(DrawnWalls):
+        def outcome(self, samples):
+            return torch.where(samples.given == Given.PAST, WALL, samples.classes), samples.colors
+
+    scene, grid = empty_scene(Walling(), evolution="model"), cell_room()
+    grid.origins[7, 4, 4:6] = 0
+    scene.add(grid)
+    assert do(scene, "toggle")
+    assert not bool(scene.cells.box(grid.corner, grid.shape).known[7, 4, 4:6].any())
+
+
 def test_a_model_that_blurs_colours_and_names_classes_changes_nothing_else():
     class Blurring(DrawnWalls):
         def sample(self, samples, steps):
@@ -187,8 +287,7 @@ def test_a_model_that_blurs_colours_and_names_classes_changes_nothing_else():
     grid.classes[grid.classes == WALL] = SOLID
     scene.add(grid)
     assert do(scene, "pick_up")
-    origins = scene.cells.box(grid.corner, grid.shape).origins
-    assert int((origins == CellOrigin.IMAGINED).sum()) == 1
+    assert int((origins(scene) == CellOrigin.IMAGINED).sum()) == 1
 
 
 AHEAD, ASIDE = ((5, 4, 5), (9, 4, 1)), ((9, 8, 5), (9, 4, 1))  # along either axis of the ground
