@@ -10,6 +10,8 @@ from persist_cli.api.memory import MapPoints
 from persist_cli.api.observations import Origin
 from persist_cli.play.ground_picture import Marks, backdrop_of_ground, backdrop_of_points, draw_ground
 from persist_cli.play.settings import GroundPose
+from tests.play.test_collisions import play_in_room
+from tests.support.rooms import look
 
 UP = (0.0, 0.0, 1.0)
 RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)
@@ -69,3 +71,21 @@ def test_the_picture_shows_the_way_and_reaches_to_the_agent():
     assert left < -3 and right > 4 and bottom < -3 and top > 0  # noqa: PT018
     assert max(picture.picture.shape) == 200
     assert len(np.unique(picture.picture.reshape(-1, 3).numpy(), axis=0)) > 2
+
+
+def test_the_way_is_a_line_that_a_jump_breaks_and_a_reset_forgets():
+    play = play_in_room(look((1.7, 1.25, 0.0), 0.0, 0.0), ahead=False)
+    for _ in range(2):
+        play.advance({"forward"})
+    here = play.shown.pose
+    play.jump(here.x, here.y - 0.25)
+    play.advance({"forward"})
+    assert [len(part) for part in play._surveyor._parts()] == [3, 2]
+    play.reset()
+    assert [len(part) for part in play._surveyor._parts()] == [1]
+
+
+def test_the_picture_reaches_over_all_of_the_way_and_shows_points_that_are_all_high_up():
+    far = draw_ground(None, Marks(FAR, FAR, [[(-3.0, -3.0), (6.0, -3.0), (-3.0, -3.0)]]), 200)
+    assert far.extent[2] > 6
+    assert color_at(drawn(points(((1.0, 2.0, 9.0), GREEN, 2))), 1.0, 2.0) == GREEN

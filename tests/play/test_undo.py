@@ -92,3 +92,13 @@ def test_an_undone_turn_shows_no_ground():
     for ground in known[-2::-1]:
         assert play.undo().free
         assert torch.equal(play._walkers.lead.surroundings.map().states, ground)
+
+
+def test_the_map_after_an_undone_step_is_the_one_before_it():
+    play = play_in_room(look((1.7, 1.25, 0.0), 0.0, 0.0), ahead=False)
+    play.advance(FORWARD)
+    play.advance(frozenset())
+    before = play.map(128)
+    play.advance(FORWARD)
+    play.undo()
+    assert torch.equal(play.map(128).picture, before.picture)

@@ -37,6 +37,11 @@ def test_a_thing_in_the_way_is_picked_up_and_then_the_way_is_free():
     assert not bool(world.agents[0].scene.cells.box(grid.corner, grid.shape).solid[BOX_CELLS].any())
 
 
+def test_what_the_first_frame_showed_of_a_thing_is_forgotten_when_it_is_picked_up_at_once():
+    _, result = walk(room_scene(), "pick_up forward forward forward forward forward")
+    assert result.free.tolist() == [True] * 6
+
+
 def test_frames_before_an_interaction_show_the_thing_and_those_after_it_do_not():
     _, result = walk(room_scene(), "stay pick_up stay")
     red = ((result.seen.rgb[..., 0] > 150) & (result.seen.rgb[..., 1] < 50)).flatten(1).sum(1).tolist()

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from persist_cli.api.memory import FrameOfReference
+from persist_cli.api.memory import FrameOfReference, MapPoints
 from persist_cli.data.store import write_trajectory
 from persist_cli.plugins import make_encoder, make_memory
-from persist_cli.viewer.drawn_cells import cells_of_memory
+from persist_cli.viewer.drawn_cells import cells_of_memory, cells_of_points
 from persist_cli.viewer.level_of_detail import DetailTree
 from persist_cli.viewer.page_server import page_server
 from persist_cli.viewer.stage import Look, Stage
@@ -43,6 +43,12 @@ def test_each_cell_of_a_map_is_one_block_in_its_place(kind, cell, degrees):
     assert int((cells.axes @ np.array(up)).argmax()) == 2
     assert {round(size, 6) for size in cells.size} == set(cell)
     assert torch.allclose(memory.points().positions, torch.from_numpy(cells.centers))
+
+
+@pytest.mark.parametrize("rise", [0.0, math.inf])
+def test_a_point_without_a_height_of_its_own_is_as_high_as_it_is_wide(rise):
+    points = MapPoints(torch.zeros(1, 3, dtype=torch.float64), torch.zeros(1, 3, dtype=torch.uint8), 0.2, rise=rise)
+    assert cells_of_points(points, (0.0, 1.0, 0.0)).size == (0.2, 0.2, 0.2)
 
 
 @pytest.mark.parametrize("lower", [0.0, 3.0])

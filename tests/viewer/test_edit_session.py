@@ -15,6 +15,7 @@ from persist_cli.memorize.memory_file import load_memory, load_paths
 from persist_cli.viewer.drawn_cells import cells_of_memory
 from persist_cli.viewer.edit_order import middle_of
 from persist_cli.viewer.edit_session import EditSession, Selected, default_out
+from persist_memory.scene.grid_scene import GridScene
 from tests.support.cell_rooms import TABLE_CELLS, camera_at
 
 
@@ -156,6 +157,25 @@ def test_many_steps_are_undone_to_the_bit(session):
         assert session.undo()
         assert all(torch.equal(tensor, state[name]) for name, tensor in session.edited.tensors().items())
     assert session.edited is session.original
+
+
+def test_undo_brings_back_what_became_of_the_edits_and_selects_nothing(session):
+    session.select_thing("table#1")
+    painted = session.paint((0, 0, 255))
+    session.shift((0.5, 0.0, 0.0))
+    assert session.outcome != painted
+    session.undo()
+    assert session.outcome == painted
+    assert session.selection == ()
+
+
+def test_each_edit_is_done_with_the_seed_of_the_session(room, tmp_path, monkeypatch):
+    seeds, edit = [], GridScene.edit
+    monkeypatch.setattr(GridScene, "edit", lambda scene, edits, seed=0: seeds.append(seed) or edit(scene, edits, seed))
+    session = EditSession(load_memory(room), {}, tmp_path / "edited.safetensors", seed=7)
+    session.select_thing("table#1")
+    session.remove()
+    assert seeds == [7]
 
 
 def test_saved_edits_that_were_undone_can_be_taken_back_in_the_file(session):

@@ -2,6 +2,7 @@
 
 import json
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -53,6 +54,8 @@ def test_a_wide_block_has_the_mean_colour_of_its_cells_and_shows_that_one_was_ed
     cells = solid_block(2)
     (part,) = DetailTree(cells).select(1)
     assert np.abs(part.colors[0] - cells.colors.mean(axis=0)).max() <= 0.5
+    nearly_one = replace(cells, colors=np.minimum(np.arange(8), 1).astype(np.uint8)[:, None].repeat(3, axis=1))
+    assert DetailTree(nearly_one).select(1)[0].colors.tolist() == [[1, 1, 1]]
     assert part.origins.tolist() == [3]
     assert painted(part, "origin").tolist() == [[216, 27, 96]]
 

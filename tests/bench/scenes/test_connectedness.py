@@ -80,6 +80,21 @@ def test_a_room_that_is_open_to_the_sky_and_faces_that_were_known_do_not_count()
     assert count_borders(grid, torch.ones(grid.shape, dtype=torch.bool)) == BorderCounts(0, 0)
 
 
+def test_faces_at_the_highest_level_do_not_count():
+    grid = two_rooms()
+    before = count_borders(grid, nothing_known(grid))
+    grid.classes[1:16, 1:8, -1], grid.classes[1:16, 8:16, -1] = OUTSIDE, FREE
+    assert count_borders(grid, nothing_known(grid)) == before
+
+
+@pytest.mark.parametrize("new", [0, 1])
+def test_a_face_counts_where_either_of_its_cells_was_imagined(new):
+    grid, known = two_rooms(), torch.ones(two_rooms().shape, dtype=torch.bool)
+    grid.classes[0, 5, 5] = OUTSIDE
+    known[new, 5, 5] = False
+    assert count_borders(grid, known).open == 1
+
+
 def places(grid, *columns):
     """World places 1.25 m above some columns."""
     return [camera_in(grid, column)[:3, 3] for column in columns]

@@ -35,6 +35,11 @@ def test_copies_of_true_layouts_are_precise_but_recall_few():
     assert math.isnan(precision_recall(true[:3], true)[0])
 
 
+def test_a_layout_is_near_within_the_distance_to_the_third_neighbour():
+    true, imagined = torch.arange(5.0)[:, None], torch.tensor([[-2.9], [100.0], [200.0], [300.0]])
+    assert precision_recall(imagined, true) == pytest.approx((0.25, 1.0, 0.2))
+
+
 @pytest.mark.parametrize("quarter", [1, 3])
 def test_a_plan_does_not_depend_on_where_the_house_lies_in_the_world(quarter):
     grid = two_rooms()

@@ -15,7 +15,7 @@ from persist_cli.api.cameras import Cameras
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.scene_edits import Copy, Move
-from persist_cli.bench.scenes.edit_part import MOVED, draw_change
+from persist_cli.bench.scenes.edit_part import MOVED, draw_change, is_visible, shows
 from persist_cli.bench.scenes.journal import SceneJournal
 from persist_cli.bench.scenes.rendering import RendererLoader, rendered_rows
 from persist_cli.bench.scenes.return_part import (
@@ -163,6 +163,23 @@ def test_a_thing_is_moved_or_copied_over_the_ground_by_a_metre_or_so(kind: str, 
         assert change.by[1] == pytest.approx(0)
     near = min(drawn, key=lambda change: change.by[0])  # towards the camera, where the room is free
     assert int((edit_grid(house, [near], None)[0].classes == TABLE).sum()) == tables
+
+
+def test_an_edit_is_measured_where_the_last_camera_sees_it_and_the_given_one_does_not() -> None:
+    house, edited = two_rooms(), two_rooms()
+    edited.classes[9:11, 7:9, 1:3] = TABLE
+    lens = torch.tensor([[16.0, 0, 16], [0, 16, 16], [0, 0, 1]])
+    ahead, back = (Cameras(camera_in(house, quarter=quarter)[None], lens[None], 32, 32) for quarter in (0, 2))
+    assert is_visible(house, edited, back, ahead)
+    assert not is_visible(house, edited, ahead, ahead)
+    assert not is_visible(house, edited, back, back)
+
+
+def test_an_edit_is_there_where_the_picture_is_more_like_the_cells_after_it() -> None:
+    before, after, picture = (torch.full((1, 2, 2, 3), shade, dtype=torch.uint8) for shade in (0, 200, 150))
+    mask = torch.ones(1, 2, 2, dtype=torch.bool)
+    assert shows(picture, [before, after], mask)
+    assert not shows(picture, [after, before], mask)
 
 
 def test_frames_of_one_clip_are_not_compared_with_each_other() -> None:
