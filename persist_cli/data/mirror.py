@@ -43,7 +43,9 @@ WAITS: Final = (1.0, 4.0)  # seconds before each new try of a web server; other 
 
 FULL: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # the disk is full, or the file too large for it
 
-VERSIONS: Final = ("ETag", "etag", "blob_id", "md5Hash", "LastModified", "last_modified", "mtime")  # of file systems
+VERSIONS: Final = (  # of file systems; many web servers tell the time of the last change alone
+    "ETag", "etag", "blob_id", "md5Hash", "LastModified", "last_modified", "Last-Modified", "mtime",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
