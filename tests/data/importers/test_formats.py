@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from persist_cli.api.importer import ForeignTrajectory, Importer
 from persist_cli.data.importers.importing import ImportPlan, run_import
-from persist_cli.data.importers.nerfstudio import Nerfstudio
+from persist_cli.data.importers.nerfstudio import Nerfstudio, read_transforms
 from persist_cli.data.importers.scannet import ScanNet
 from persist_cli.data.importers.tum import TumRgbd, poses_at, read_listing
 from persist_cli.data.store import Store
@@ -28,6 +28,7 @@ FORMATS: dict[str, tuple[type[Importer], Callable[..., Path]]] = {
     "tum": (TumRgbd, write_tum), "scannet": (ScanNet, write_scannet), "nerfstudio": (Nerfstudio, write_nerfstudio)
 }  # fmt: skip
 EXACT = {"tum": 0.00011, "scannet": 0.00051, "nerfstudio": 0.00051}  # metres, half a unit of depth
+SECONDS = {"tum": 0.1, "scannet": 1 / 30, "nerfstudio": 1.0}  # between two frames
 
 
 def read(name: str, source: Path) -> ForeignTrajectory:
@@ -60,6 +61,7 @@ def test_a_capture_is_imported_as_it_was(name: str, capture: Path) -> None:
         assert frame.depth[0, 0] == 0
         assert np.abs(frame.depth - truth[number].depth)[1:].max() < EXACT[name]
         assert frame.world_from_camera == pytest.approx(poses(24)[number], abs=1e-6)
+        assert frame.timestamp - frames[0].timestamp == pytest.approx((number - first) * SECONDS[name], abs=1e-6)
 
 
 def test_an_imported_capture_can_be_inspected(name: str, capture: Path, persist: Any, tmp_path: Path) -> None:
@@ -81,6 +83,15 @@ def test_a_folder_of_captures_is_as_many_scenes(name: str, capture: Path, tmp_pa
         usable(FORMATS[name][0](), tmp_path / "nowhere")
 
 
+def test_a_capture_has_the_name_of_its_folder_as_it_was_given(
+    name: str, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "hall").symlink_to(capture)
+    assert read(name, tmp_path / "hall").name == "hall"
+    monkeypatch.chdir(capture)
+    assert read(name, Path()).name == "room"
+
+
 def test_the_importers_are_plugins(name: str) -> None:
     assert load_plugin("importer", name) is FORMATS[name][0]
 
@@ -92,6 +103,14 @@ def test_a_damaged_image_is_left_out_or_named(name: str, capture: Path, tmp_path
         run_import(name, capture, tmp_path / "out", ImportPlan(), True)
     run_import(name, capture, tmp_path / "out", ImportPlan(skip_bad=True), True)
     assert len(Store(tmp_path / "out")[0]) == (4 if name == "tum" else 3)
+
+
+def test_where_no_image_can_be_read_the_first_one_is_named(name: str, capture: Path) -> None:
+    for image in capture.glob("*/*.png"):
+        image.write_bytes(b"")
+    first = {"tum": "1305031102.100000.png", "scannet": "0.png", "nerfstudio": "frame_0.png"}[name]
+    with pytest.raises(DataError, match=f"/{first}: not a whole image"):
+        read(name, capture)
 
 
 def rewrite(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
@@ -159,6 +178,14 @@ def test_tum_depth_belongs_to_the_colours_nearest_in_time_in_whatever_order_it_i
         assert np.abs(frame.depth - truth[number].depth)[1:].max() < EXACT["tum"]
 
 
+def test_tum_says_how_many_of_its_colour_images_have_no_depth_or_pose(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "room")  # whose first image has no pose
+    lines = (folder / "depth.txt").read_text().splitlines()
+    (folder / "depth.txt").write_text("\n".join(lines[:-1]))
+    trajectory = read("tum", folder)
+    assert (trajectory.length, trajectory.info.source["without_partners"]) == (4, 2)
+
+
 @pytest.mark.parametrize(
     ("file", "text", "cause"),
     [
@@ -178,6 +205,7 @@ def test_tum_depth_belongs_to_the_colours_nearest_in_time_in_whatever_order_it_i
         ("depth.txt", "# none", "no colour image has a depth image and a true pose"),
         ("rgb.txt", "# none", "no colour image has a depth image and a true pose"),
         ("camera-intrinsics.txt", "500 9 32 0 500 24 0 0 1", "a skew of 9 pixels; rectify the images first"),
+        ("camera-intrinsics.txt", "500 -9 32 0 500 24 0 0 1", "a skew of -9 pixels; rectify the images first"),
     ],
 )
 def test_a_broken_tum_recording_is_one_line(tmp_path: Path, file: str, text: str | None, cause: str) -> None:
@@ -211,9 +239,22 @@ def test_the_matrices_of_scannet_may_stand_beside_the_folders_of_images(tmp_path
     assert read("scannet", scan).info.intrinsics == pytest.approx(ROOM.intrinsics)
 
 
-def resize_colors(scan: Path) -> None:
-    for path in scan.glob("color/*"):
-        Image.open(path).resize((64, 48)).save(path)
+def test_a_pose_of_scannet_without_a_colour_image_is_a_frame_that_is_named(tmp_path: Path) -> None:
+    scan = write_scannet(tmp_path / "scene0000_00")
+    (scan / "color/2.png").unlink()
+    frames = list(read("scannet", scan).frames)
+    assert [isinstance(frame, DataError) for frame in frames] == [False, False, True, False]
+    assert "color/2.jpg: no such file" in str(frames[2])
+
+
+def resize_colors(size: tuple[int, int]) -> Callable[[Path], None]:
+    """What gives the colour images another width and height."""
+
+    def resize(scan: Path) -> None:
+        for path in scan.glob("color/*"):
+            Image.open(path).resize(size).save(path)
+
+    return resize
 
 
 @pytest.mark.parametrize(
@@ -223,7 +264,10 @@ def resize_colors(scan: Path) -> None:
         (lambda scan: (scan / "intrinsic/intrinsic_depth.txt").unlink(), "intrinsic_depth.txt: no such file"),
         (lambda scan: np.savetxt(scan / "intrinsic/extrinsic_color.txt", np.diag([1, -1, -1, 1])),
          "extrinsic_color.txt: the color camera is not that of the poses"),
-        (resize_colors, "48×64 pixels, the matrix of the colour camera is of about 96×128"),
+        (lambda scan: np.savetxt(scan / "intrinsic/extrinsic_depth.txt", np.diag([1, -1, -1, 1])),
+         "extrinsic_depth.txt: the depth camera is not that of the poses"),
+        (resize_colors((64, 48)), "48×64 pixels, the matrix of the colour camera is of about 96×128"),
+        (resize_colors((128, 48)), "48×128 pixels, the matrix of the colour camera is of about 96×128"),
     ],
 )  # fmt: skip
 def test_a_broken_scan_is_one_line(tmp_path: Path, breaks: Callable[[Path], object], cause: str) -> None:
@@ -251,6 +295,19 @@ def test_frames_of_nerfstudio_with_lenses_of_their_own_get_one(tmp_path: Path) -
     assert 0 < wide < 4
 
 
+def test_the_lens_of_nerfstudio_is_read_whole_from_a_file_of_any_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    capture = write_nerfstudio(tmp_path / "room", 1)
+    bent = {"fl_y": 77.0, "k1": 0.1, "k2": 0.2, "p1": 0.01, "p2": 0.02, "k3": 0.3}
+    rewrite(capture / "transforms.json", set_values(**bent))
+    lens = read_transforms(capture / "transforms.json").frames[0].lens
+    assert (lens.fx, lens.fy) == (2 * ROOM.intrinsics[0, 0], 77.0)
+    assert lens.distortion == (0.1, 0.2, 0.01, 0.02, 0.3)
+    monkeypatch.chdir(capture)
+    assert read("nerfstudio", Path("transforms.json")).name == "room"
+
+
 def set_values(**changes: Any) -> Callable[[dict[str, Any]], None]:
     return lambda values: values.update(changes)
 
@@ -265,6 +322,7 @@ def set_first(**changes: Any) -> Callable[[dict[str, Any]], None]:
         (set_values(frames=[]), "transforms.json: it lists no frames"),
         (set_values(frames=[{}]), "transforms.json: frame 0 has no file_path"),
         (set_values(camera_model="OPENCV_FISHEYE"), "a OPENCV_FISHEYE camera; undistort the images"),
+        (set_values(is_fisheye=True), "camera; undistort the images"),
         (set_values(k4=0.1), "its intrinsics are none of OpenCV's pinhole camera"),
         (set_values(fl_x="wide"), "its intrinsics are not numbers"),
         (set_values(h=float("inf")), "its intrinsics are not numbers"),

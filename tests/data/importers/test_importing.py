@@ -57,6 +57,26 @@ def test_bad_frames_between_the_kept_ones_do_not_matter() -> None:
     assert len(list(ImportPlan(every=2).frames(trajectory, []))) == 2
 
 
+def test_between_frames_of_which_only_every_second_is_kept_the_motion_is_free() -> None:
+    trajectory, plan = walked(steps(["forward", "left", "forward", "stay", "left"])), ImportPlan(every=2)
+    assert [frame.action for frame in plan.frames(trajectory, [])] == ["free", "free", None]
+    assert plan.length(trajectory) == 3
+    assert plan.info(trajectory.info).vocabulary.names == ("free",)
+
+
+@pytest.mark.parametrize("plan", [ImportPlan(step=0.1), ImportPlan(turn=5.0)])
+def test_walking_actions_are_stored_where_either_of_their_sizes_is_given(plan: ImportPlan) -> None:
+    vocabulary = plan.info(ROOM.info).vocabulary
+    assert vocabulary["forward"].forward == (plan.step or 0.25)
+    assert vocabulary["left"].turn == (plan.turn or 15.0)
+
+
+def test_frames_that_are_held_out_are_read_too_so_that_they_are_checked() -> None:
+    trajectory = walked(steps(["forward"] * 4))
+    assert len(list(ImportPlan(hold_out=0.5, part="train").frames(trajectory, []))) == 2
+    assert next(iter(trajectory.frames), None) is None
+
+
 def test_sizes_of_actions_are_not_changed_under_recorded_frames() -> None:
     with pytest.raises(DataError, match=r"actions of their own, .*forward \(0\.25 m ahead\)"):
         ImportPlan(step=0.1).info(walked([]).info)

@@ -77,6 +77,11 @@ def test_depth_of_another_lens_is_that_of_the_nearest_pixel_and_missing_beyond_t
     assert not moved[:, :2].any()
 
 
+def test_a_matrix_that_counts_from_the_centre_of_the_first_pixel_moves_by_half_a_pixel() -> None:
+    matrix = np.array([[500.0, 0, 319.5], [0, 520, 239.5], [0, 0, 1]])
+    assert Lens.of_pixel_centres(matrix) == Lens(500.0, 520.0, 320.0, 240.0)
+
+
 def test_the_same_lens_changes_no_pixel() -> None:
     image = seen(LENS, (48, 64))
     assert retake(image, LENS, LENS, (48, 64)) is image

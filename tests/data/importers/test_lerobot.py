@@ -21,7 +21,7 @@ from persist_cli.data.importers.readers import decode_color
 from persist_cli.data.store import Store
 from persist_cli.errors import DataError, PersistError
 from persist_cli.plugins import load_plugin
-from tests.support.foreign_captures import FROM_Y_UP
+from tests.support.foreign_captures import FROM_Y_UP, usable
 from tests.support.lerobot_datasets import (
     COLOR,
     DEPTH,
@@ -31,9 +31,12 @@ from tests.support.lerobot_datasets import (
     ROBOT,
     ROOM,
     change_info,
+    change_table,
     codes,
+    picture,
     poses,
     read_all,
+    stored_depth,
     video,
     write_codes,
     write_later_episode,
@@ -130,6 +133,22 @@ def test_episodes_can_be_scenes_of_their_own(dataset: Path) -> None:
     assert [one.info.scene for one in read_all(dataset)] == ["room", "room"]
 
 
+def test_the_episodes_of_one_scene_share_its_up_axis(dataset: Path) -> None:
+    shared, own = (
+        [one.info.world_up for one in read_all(dataset, replace(POSE, scene=scene))] for scene in ("dataset", "episode")
+    )
+    assert shared[0] == shared[1]
+    assert own[0] != own[1]
+
+
+def test_the_up_axis_that_is_given_wins_over_that_of_robots(dataset: Path) -> None:
+    importer = LeRobot(replace(POSE, axes="robot"))
+    importer.up = (0.0, 0.0, -1.0)
+    for episode in usable(importer, dataset):
+        assert episode.info.world_up == (0, 0, -1)
+        assert episode.info.source["world_up"].startswith("given")
+
+
 def test_some_episodes_are_read_and_others_are_added_later(persist: Any, dataset: Path, tmp_path: Path) -> None:
     for chosen, states in (("1", ["written"]), ("0-2", ["written", "already there"]), ("0-9", ["already there"] * 2)):
         words = ("--set", "pose=observation.pose", "--set", f"episodes={chosen}", "--up", "0,0,1")
@@ -161,6 +180,35 @@ def test_depth_of_another_size_is_resampled(dataset: Path) -> None:
     assert (episode.info.height, episode.info.width) == (24, 32)
     assert episode.info.intrinsics[:2] == pytest.approx(ROOM.intrinsics[:2] / 2)
     assert [frame.rgb.shape for frame in episode.frames] == [(24, 32, 3)] * 4
+
+
+@pytest.mark.parametrize("shape", [[48, 64, 3], [3, 48, 64], [48, 64, 1], [1, 48, 64], [48, 64]])
+def test_the_size_of_images_is_known_wherever_their_channels_stand(shape: list[int]) -> None:
+    assert ImageFeature.of("front", {"dtype": "video", "shape": shape}).size == (48, 64)
+
+
+@pytest.mark.parametrize(
+    ("said", "is_depth"),
+    [
+        ({"info": {"is_depth_map": True}}, True),
+        ({"info": {"video.is_depth_map": True}}, True),
+        ({"video_info": {"video.is_depth_map": True}}, True),
+        ({"info": {"video.is_depth_map": False}, "video_info": None}, False),
+    ],
+)
+def test_depth_is_marked_in_any_of_the_ways_of_lerobot(said: dict[str, Any], is_depth: bool) -> None:
+    assert ImageFeature.of("front", {"dtype": "video", "shape": [48, 64, 1], **said}).is_depth is is_depth
+
+
+def test_a_distance_in_metres_that_is_none_is_missing_depth(tmp_path: Path) -> None:
+    dataset = write_lerobot(tmp_path / "room", (2,), stored="m")
+    depth = [stored_depth(frame.depth, "m") for frame in ROOM.frames(poses(2, "quaternion")[1])]
+    for image in depth:
+        image[0, :4] = np.nan, np.inf, -np.inf, -1
+    change_table(dataset, "data", lambda rows: rows.update({DEPTH: [picture(image, "TIFF") for image in depth]}))
+    for frame, image in zip(read_all(dataset)[0].frames, depth, strict=True):
+        assert not frame.depth[0, :4].any()
+        assert np.array_equal(frame.depth[1:], image[1:])
 
 
 def test_codes_in_proportion_are_read_too() -> None:

@@ -18,6 +18,7 @@ from PIL import Image
 
 from persist_cli.api.importer import ForeignTrajectory
 from persist_cli.data.importers.importing import ImportPlan, run_import
+from persist_cli.data.importers.lenses import Lens
 from persist_cli.data.importers.record3d import Record3D
 from persist_cli.data.importers.stray import StrayScanner
 from persist_cli.data.importers.turning import QuarterTurns
@@ -28,6 +29,7 @@ from persist_cli.plugins import load_plugin
 from tests.support.foreign_captures import usable
 from tests.support.phone_captures import (
     ROOM,
+    TIMES,
     relative_poses,
     rolled,
     turned_matrix,
@@ -111,6 +113,12 @@ def test_a_folder_of_scans_is_as_many_scenes(tmp_path: Path) -> None:
     assert [one.info.scene for one in StrayScanner().trajectories(tmp_path / "all")] == ["a", "b"]
     with pytest.raises(DataError, match=r"nowhere: neither odometry.csv in it nor folders with one"):
         stray(tmp_path / "nowhere")
+
+
+def test_a_phone_that_was_turned_for_one_frame_turns_no_image(tmp_path: Path) -> None:
+    scan, pose = write_stray(tmp_path / "room"), walk(24)[0]
+    change_line(scan, 1, ", ".join(map(str, [100, 0, *pose[:3, 3], *rolled(pose, 1).as_quat()])))
+    assert stray(scan).info.source["world_up"] == "y, as the format has it"
 
 
 def test_a_row_of_a_scan_belongs_to_the_pictures_of_its_number(tmp_path: Path) -> None:
@@ -217,6 +225,12 @@ def test_a_turned_camera_sees_the_same_point_where_the_turned_image_shows_it(tur
     row, column = np.argwhere(found.image(marked))[0]
     seen = ROOM.intrinsics @ (np.linalg.inv(found.pose(poses[0])) @ point)[:3]
     assert seen[:2] / seen[2] == pytest.approx([column + 0.5, row + 0.5])
+
+
+def test_the_lens_of_a_turned_image_is_turned_with_it() -> None:
+    lens = Lens(50.0, 60.0, 30.0, 20.0)
+    assert QuarterTurns(1).camera(lens, (48, 64)) == (Lens(60.0, 50.0, 20.0, 34.0), (64, 48))
+    assert QuarterTurns(2).camera(lens, (48, 64)) == (Lens(50.0, 60.0, 34.0, 28.0), (48, 64))
 
 
 def test_a_camera_that_looks_down_is_not_turned() -> None:
@@ -333,6 +347,36 @@ def test_a_frame_of_a_recording_that_cannot_be_used_is_named_or_left_out(
         run_import("record3d", path, tmp_path / "out", ImportPlan(), True)
     run_import("record3d", path, tmp_path / "out", ImportPlan(skip_bad=True), True)
     assert len(Store(tmp_path / "out")[0]) == 3
+
+
+def test_depth_of_the_size_that_is_said_of_the_colours_needs_no_size_of_its_own(tmp_path: Path) -> None:
+    path = write_record3d(tmp_path / "room.r3d", 2)
+    changed(dh=None, dw=None, h=ROOM.height, w=ROOM.width)(path)
+    assert [frame.depth.shape for frame in record3d(path).frames] == [(48, 64)] * 2
+
+
+def test_a_distance_of_a_recording_that_is_none_is_missing_depth(tmp_path: Path) -> None:
+    path = write_record3d(tmp_path / "room.r3d", 2, confidence=False)
+    depth = np.ones((48, 64), np.float32)
+    depth[0, :4] = np.nan, np.inf, -np.inf, -1
+    replaced(path, "rgbd/1.depth", lzfse.compress(depth.tobytes()))
+    assert (list(record3d(path).frames)[1].depth[0, :5] > 0).tolist() == [False] * 4 + [True]
+
+
+def test_the_focal_length_along_columns_is_not_that_along_rows(tmp_path: Path) -> None:
+    expected = np.diag([1, 1.1, 1]) @ ROOM.intrinsics
+    (fx, _, cx), (_, fy, cy), _ = np.diag([TIMES, TIMES, 1]) @ expected
+    column_major = [fx, 0, 0, 0, fy, 0, cx, cy, 1]
+    for name, values in {
+        "each.r3d": {"perFrameIntrinsicCoeffs": [[fx, fy, cx, cy]] * 2},
+        "one.r3d": {"perFrameIntrinsicCoeffs": None, "K": column_major},
+    }.items():
+        path = write_record3d(tmp_path / name, 2)
+        changed(**values)(path)
+        assert record3d(path).info.intrinsics == pytest.approx(expected)
+    scan = write_stray(tmp_path / "room", 2)
+    np.savetxt(scan / "camera_matrix.csv", np.reshape(column_major, (3, 3)).T, delimiter=", ")
+    assert stray(scan).info.intrinsics == pytest.approx(expected)
 
 
 def test_a_folder_without_recordings_is_one_line(tmp_path: Path) -> None:

@@ -109,6 +109,10 @@ def test_an_up_axis_without_level_surfaces_is_said_to_be_guessed(persist, sequen
 def test_timestamps_follow_the_frame_numbers(sequence: Path) -> None:
     (trajectory,) = usable(SevenScenes(), sequence)
     assert [frame.timestamp for frame in trajectory.frames] == pytest.approx([0, 0.1, 0.2, 0.3])
+    for path in sequence.glob("frame-000000.*"):
+        path.unlink()
+    (trajectory,) = usable(SevenScenes(), sequence)
+    assert [frame.timestamp for frame in trajectory.frames] == pytest.approx([0, 0.1, 0.2])
 
 
 def remove(name: str):
@@ -215,6 +219,14 @@ def test_a_second_import_leaves_finished_trajectories_alone(sequence: Path, tmp_
         run_import("7scenes", sequence, tmp_path / "out", ImportPlan(size=(24, 24)), False)
 
 
+def test_as_many_frames_of_another_choice_are_not_taken_for_those_that_were_imported(
+    sequence: Path, tmp_path: Path
+) -> None:
+    run_import("7scenes", sequence, tmp_path / "out", ImportPlan(every=2), False)
+    with pytest.raises(DataError, match="of other settings"):
+        run_import("7scenes", sequence, tmp_path / "out", ImportPlan(every=3), False)
+
+
 LOST = "-1.#IND " * 16
 
 
@@ -226,6 +238,15 @@ def test_bad_frames_are_left_out_with_a_count_and_their_causes(sequence: Path, t
     assert "│ kitchen    │      2 │        2 │" in text
     assert "frame-000003.depth.png: not a whole image" in text
     assert "frame-000006.pose.txt: not a text file of numbers" in text
+
+
+def test_of_many_bad_frames_the_first_causes_are_printed_and_the_others_counted(tmp_path: Path, capsys) -> None:
+    sequence = write_sequence(tmp_path / "kitchen", 6)
+    for path in sorted(sequence.glob("*.pose.txt"))[1:]:
+        path.write_text(LOST)
+    run_import("7scenes", sequence, tmp_path / "out", ImportPlan(skip_bad=True), False)
+    text = capsys.readouterr().out
+    assert (text.count("pose.txt: not a text file"), "; and 2 more" in text) == (3, True)
 
 
 def test_a_bad_frame_is_named_with_the_option_that_leaves_it_out(sequence: Path, tmp_path: Path) -> None:
@@ -273,8 +294,9 @@ def test_an_import_stores_walking_actions_beside_the_free_motion(sequence: Path,
     assert file.actions() == ("free", "free", "free", None)
 
 
-def test_frames_at_the_end_can_be_held_out_of_the_training_part(tmp_path: Path) -> None:
+def test_frames_at_the_end_can_be_held_out_of_the_training_part(tmp_path: Path, capsys) -> None:
     run_import("7scenes", write_sequence(tmp_path / "kitchen", 10), tmp_path / "out", ImportPlan(hold_out=0.3), False)
+    assert f"next: persist inspect {tmp_path / 'out/test'}\n" in capsys.readouterr().out
     train, test = (Store(tmp_path / "out" / part)[0] for part in ("train", "test"))
     assert (len(train), len(test)) == (7, 10)
     assert torch.equal(train.read().observations.rgb, test.read(slice(0, 7)).observations.rgb)
