@@ -65,6 +65,8 @@ def test_the_data_path_is_one_folder_or_a_list():
      (["steps"], "KEY=VALUE"), (["stage=2"], "stage 2 needs a memory"), (["data.strides=[0]"], "data.strides"),
      (["training.precision=fp8"], "training.precision"), (["data.path=3"], "data.path"),
      (["training.batch=5", "training.accumulation=2"], "multiple of accumulation"),
+     (["base=a", "distill.levels=8", "training.ema=0"], "distill learns from averaged weights: set training.ema=0.99"),
+     (["training.frozen_precision=bf16", "training.precision=no"], "frozen_precision bf16 needs training.precision"),
      (["training.steps=200", "training.cooldown=201"], "set both, as in training.steps=200 training.cooldown=66"),
      (["data.true_cells=1"], "data.true_cells is for stage 2 only"),
      (["adapter.form=canvas"], "adapter is for stage 2"),
@@ -76,6 +78,13 @@ def test_an_error_in_a_recipe_is_one_line(overrides, cause):
     with pytest.raises(RecipeError, match=cause) as error:
         make_recipe(apply_overrides(read_recipe("tiny-stage1"), overrides), "tiny-stage1")
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("change", ["data.mirror=0.5", "data.color_jitter=0.1"])
+def test_true_cells_are_not_mirrored_or_coloured(change):
+    values = apply_overrides(read_recipe("tiny-stage2-voxel"), ["data.true_cells=0.5", change])
+    with pytest.raises(RecipeError, match=r"data\.true_cells takes no data\.mirror and no data"):
+        make_recipe(values, "x")
 
 
 @pytest.mark.parametrize(

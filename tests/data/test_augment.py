@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from persist_cli.api.geometry import project, unproject
-from persist_cli.data.augment import Augmentation, View, mirrored_cameras
+from persist_cli.data.augment import Augmentation, View, mirrored_cameras, random_window
 from persist_cli.data.clips import ClipDataset, ClipPlan
 from persist_cli.data.images import CropResize
 from persist_cli.data.store import Store
@@ -63,6 +63,27 @@ def test_mirroring_twice_is_the_identity_and_heights_stay(walks):
     assert torch.linalg.det(once.world_from_camera[:, :3, :3]).tolist() == pytest.approx([1.0, 1.0])
     assert torch.allclose(mirrored_cameras(once, up).world_from_camera, cameras.world_from_camera)
     assert not torch.allclose(once.world_from_camera, cameras.world_from_camera)
+
+
+def test_in_an_image_that_is_no_square_a_mirrored_camera_is_turned_round_along_its_rows(walks):
+    cameras = replace(Store(walks)[0].cameras([0]), width=200)
+    cameras.intrinsics[:, 0, 2] = 30
+    assert float(mirrored_cameras(cameras, (0.0, 1.0, 0.0)).intrinsics[0, 0, 2]) == 170
+
+
+def test_a_window_may_lie_anywhere_in_an_image_that_is_no_square():
+    random = np.random.default_rng(0)
+    windows = [random_window((24, 64), (8, 16), 0.5, random) for _ in range(500)]
+    assert {(one.window, one.size) for one in windows} == {((12, 24), (8, 16))}
+    for places, last in (([one.top for one in windows], 12), ([one.left for one in windows], 40)):
+        assert (min(places), max(places)) == (0, last)
+
+
+def test_each_colour_has_its_factor_and_what_becomes_too_bright_is_white(walks):
+    frames = Store(walks)[0].read(slice(0, 1)).observations
+    grey = replace(frames, rgb=torch.full_like(frames.rgb, 200))
+    seen = View(None, False, (2.0, 1.0, 0.5)).observations(grey, (0.0, 1.0, 0.0))
+    assert seen.rgb[0, 0, 0].tolist() == [255, 200, 100]
 
 
 def test_clip_and_memory_are_one_view(walks):

@@ -19,6 +19,17 @@ def test_the_view_is_that_from_top_to_bottom_and_of_a_window_less() -> None:
     assert vertical_view(NARROW, 0.5) == pytest.approx(23.2, abs=0.1)
 
 
+def test_the_view_from_top_to_bottom_does_not_depend_on_width_and_focal_length_across() -> None:
+    wide = replace(NARROW, width=200, intrinsics=np.array([[500.0, 0, 100], [0, 78.0, 32], [0, 0, 1]]))
+    assert vertical_view(wide) == vertical_view(NARROW)
+
+
+def test_a_wider_view_than_that_of_the_training_is_named_too() -> None:
+    line = unfamiliar_view([NARROW], TrainingScenes(fov=(30.0, 35.0)))
+    assert line is not None
+    assert "see 45° from top to bottom, those of the training saw 30° to 35°" in line
+
+
 def test_another_view_than_that_of_the_training_is_named_with_both() -> None:
     line = unfamiliar_view([NARROW], TrainingScenes(fov=(75.0, 75.0)))
     assert line is not None

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from persist_cli.data.images import crop_resize, decode_rgb, parse_size
+from persist_cli.data.images import crop_resize, decode_depth, decode_rgb, encode_rgb, parse_size
 from persist_cli.data.importers.readers import read_color, read_photo
 from persist_cli.errors import DataError
 from tests.support.damage import write_huge_image
@@ -76,13 +76,19 @@ def test_a_text_that_is_no_size_is_refused(text: str) -> None:
         parse_size(text)
 
 
-def test_a_size_that_would_fill_the_memory_is_refused() -> None:
-    with pytest.raises(DataError, match="'100000x64' is beyond 4096x4096 pixels"):
-        parse_size("100000x64")
+@pytest.mark.parametrize("text", ["100000x64", "64x100000"])
+def test_a_size_that_would_fill_the_memory_is_refused(text: str) -> None:
+    with pytest.raises(DataError, match=f"'{text}' is beyond 4096x4096 pixels"):
+        parse_size(text)
 
 
 def test_a_size_is_height_by_width() -> None:
-    assert parse_size("240x320") == (240, 320)
+    assert parse_size("240x320") == parse_size("240X320") == parse_size("240×320") == (240, 320)
+
+
+def test_an_image_of_several_channels_is_no_depth() -> None:
+    with pytest.raises(ValueError, match="a depth image must have one channel"):
+        decode_depth(encode_rgb(np.zeros((2, 2, 3), np.uint8)))
 
 
 def test_a_photo_is_turned_as_its_exif_says_and_the_image_of_a_capture_is_not(tmp_path: Path) -> None:

@@ -120,7 +120,7 @@ def test_cameras_without_images_equal_those_of_the_frames_that_are_read(path: Pa
     assert torch.equal(file.cameras(frames).intrinsics, cameras.intrinsics)
 
 
-@pytest.mark.parametrize("frames", [slice(0, 21), [20], [-1], [], slice(4, 4)])
+@pytest.mark.parametrize("frames", [slice(0, 21), slice(-21, None), [20], [-1], [], slice(4, 4)])
 def test_frames_outside_a_trajectory_are_refused(path: Path, frames: slice | list[int]) -> None:
     with pytest.raises(DataError, match=r"one\.parquet: (has 20 frames|no frames asked for)"):
         TrajectoryFile(path).read(frames)
@@ -220,6 +220,23 @@ def test_a_newer_version_is_refused(path: Path) -> None:
     header = table.schema.metadata[b"persist"].replace(b'"version": 1', b'"version": 2')
     pq.write_table(table.replace_schema_metadata({b"persist": header}), path)
     with pytest.raises(DataError, match="version 2; this persist reads"):
+        TrajectoryFile(path).read()
+
+
+@pytest.mark.parametrize(
+    ("written", "found", "cause"),
+    [
+        (b'"height": 16', b'"height": 61', "its header is damaged, the checksum is wrong; take a whole copy"),
+        (b"persist-trajectory", b"persist-checkpoint", "written as persist-checkpoint version 1; this persist reads"),
+    ],
+)
+def test_a_header_that_is_not_as_it_was_written_is_refused(
+    path: Path, written: bytes, found: bytes, cause: str
+) -> None:
+    table = pq.read_table(path)
+    header = table.schema.metadata[b"persist"].replace(written, found)
+    pq.write_table(table.replace_schema_metadata({b"persist": header}), path)
+    with pytest.raises(DataError, match=cause):
         TrajectoryFile(path).read()
 
 
