@@ -7,12 +7,14 @@ import json
 
 import pytest
 import torch
+import yaml
 
 from persist_cli.api.backbone import Sampling
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.inference import PROTOCOLS as PROTOCOL_NAMES
 from persist_cli.api.inference import SamplingOverrides
 from persist_cli.api.stages import Lora
+from persist_cli.checkpoints.exported_files import without_absolute_paths
 from persist_cli.checkpoints.load import load_adapter, load_backbone
 from persist_cli.checkpoints.save import save_base, save_lora
 from persist_cli.errors import CheckpointError
@@ -253,6 +255,31 @@ def test_an_export_has_the_recipes_of_all_stages_without_absolute_paths(persist,
     assert not any(str(codec.parent) in text for text in recipes.values())
     assert persist("export", tmp_path / "m", "--out", tmp_path / "again").code == 0
     assert (tmp_path / "m/SHA256SUMS").read_bytes() == (tmp_path / "again/SHA256SUMS").read_bytes()
+
+
+def test_of_every_place_in_a_recipe_only_the_last_part_is_kept():
+    recipe = {
+        "base": "/a/run/step-00000004",
+        "adapter_from": "/a/adapter",
+        "distill": {"teacher": "/a/teacher"},
+        "data": {"path": ["/a/houses", "near/houses"]},
+        "backbone": {"settings": {"pretrained": "/a/weights", "prompt_embedding": "/a/prompt.safetensors"}},
+        "memory": {"settings": {"model": "/a/scene"}},
+    }
+    assert yaml.safe_load(without_absolute_paths(yaml.safe_dump(recipe), "recipe")) == {
+        "base": "run",
+        "adapter_from": "adapter",
+        "distill": {"teacher": "teacher"},
+        "data": {"path": ["houses", "near/houses"]},
+        "backbone": {"settings": {"pretrained": "weights", "prompt_embedding": "prompt.safetensors"}},
+        "memory": {"settings": {"model": "scene"}},
+    }
+
+
+def test_a_name_is_given_to_one_adapter_and_not_to_several(export, persist, runs, tmp_path):
+    export(tmp_path / "two", runs / "voxel", runs / "none")
+    ended = persist("export", runs / "stage1", f"mine={tmp_path / 'two'}", "--out", tmp_path / "m")
+    assert (ended.code, "NAME=RUN names one adapter, there are none, voxel" in ended.err) == (1, True), ended.err
 
 
 def test_no_exported_configuration_says_where_it_was_loaded_from(persist, walks, codec, tmp_path):

@@ -83,6 +83,13 @@ def test_a_checkpoint_that_another_run_stands_on_is_kept(here):
     assert mark == {"checkpoint": "step-00000002", "run": "../runs/none"}
 
 
+def test_of_many_runs_that_stand_on_a_checkpoint_one_is_named_and_the_others_counted(here):
+    run = write_steps(here / "run", 1)
+    for name in ("a", "b", "c"):
+        mark_in_use(find_checkpoint(run), here / name)
+    assert said(run) == ["step 1 (a and 2 more stand on it)"]
+
+
 def test_a_mark_that_is_damaged_still_keeps_its_checkpoint(here):
     run = write_steps(here / "run", 1, 2)
     mark_in_use(find_checkpoint(run / "step-00000001/model"), here / "voxel")

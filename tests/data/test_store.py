@@ -163,6 +163,7 @@ def test_a_wrong_frame_is_named_and_nothing_is_written(tmp_path: Path, change: d
         ({"intrinsics": np.array([[1.0, 1, 0], [1, 1, 0], [0, 0, 1]])}, "not a pinhole matrix$"),
         ({"source": {"fps": np.float32(30)}}, "its source must hold values of JSON"),
         ({"world_up": (0.0, 0.0, 0.0)}, "unit vector"),
+        ({"world_up": (0.0, 1.5, 0.0)}, "unit vector"),
         ({"height": 0}, "image size of 0×24 is none"),
         ({"height": None}, r"image size of \(None, 24\) is not two whole numbers"),
         ({"height": 16.0}, r"image size of \(16\.0, 24\) is not two whole numbers"),

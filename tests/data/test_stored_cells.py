@@ -14,7 +14,8 @@ import torch
 
 from persist_cli.api.cells import COMMON, CellForm, CellGrid
 from persist_cli.api.ground import ground_axes
-from persist_cli.data.store import FRAMES_PER_GROUP, TrajectoryFile, write_trajectory
+from persist_cli.data.check.inspect import figures_table, trajectory_figures
+from persist_cli.data.store import FRAMES_PER_GROUP, Store, TrajectoryFile, write_trajectory
 from persist_cli.data.stored_cells import CellBox
 from persist_cli.errors import DataError
 from tests.support.noise import INFO, make_frames
@@ -41,6 +42,13 @@ def path(tmp_path: Path) -> Path:
     frames = [replace(frame, cells=grid_at(number)) for number, frame in enumerate(make_frames())]
     write_trajectory(tmp_path / "one.parquet", INFO, frames)
     return tmp_path / "one.parquet"
+
+
+def test_inspect_counts_the_trajectories_that_have_cells(path: Path) -> None:
+    write_trajectory(path.with_name("two.parquet"), INFO, make_frames(2))
+    figures = [trajectory_figures(file) for file in Store(path.parent)]
+    assert [one.cells for one in figures] == [True, False]
+    assert dict(figures_table(figures, {}))["trajectories with the cells of their scene"] == "1"
 
 
 def rewrite(path: Path, column: list[bytes | None]) -> None:

@@ -7,6 +7,7 @@ import json
 import os
 import shlex
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,10 +17,19 @@ from persist_backbones.cogvideox.inputs import _fitted_positions
 from persist_cli.api.backbone import Backbone
 from persist_cli.api.clips import ClipLatents
 from persist_cli.doctor import doctor as doctor_module
-from persist_cli.doctor.changes import CHECKPOINTING, EIGHT_BIT, FROZEN, LORA, OFFLOAD, Strategy, strategies
+from persist_cli.doctor.changes import (
+    CHECKPOINTING,
+    EIGHT_BIT,
+    FROZEN,
+    LORA,
+    OFFLOAD,
+    Strategy,
+    available_changes,
+    strategies,
+)
 from persist_cli.doctor.doctor import Doctor, _verdict, launch_command
 from persist_cli.doctor.machine import GIB, Machine, machine_of, memory_here
-from persist_cli.doctor.memory_estimate import Launch
+from persist_cli.doctor.memory_estimate import Launch, MemoryEstimate
 from persist_cli.doctor.meta_model import MetaModel, build_meta_model
 from persist_cli.doctor.step import Encoding, ShallowCopies, StepKind
 from persist_cli.doctor.tracing import LiveBytes, fake_tensors
@@ -129,6 +139,38 @@ def test_a_discriminator_is_counted_with_all_that_its_training_takes():
     more = {name: value - plain.to_json()[name] for name, value in against.to_json().items()}
     assert (more["weights"], more["gradients"], more["optimizer"], more["average"]) == (size, size, 2 * size, size)
     assert against.activations > plain.activations
+
+
+def test_the_peak_is_that_of_encoding_of_activations_or_of_the_update():
+    update = MemoryEstimate(weights=100, gradients=10, optimizer=20, average=5, update=7, kept=False, host=0)
+    assert update.peak == 100 + 20 + 5 + 10 + 7
+    assert replace(update, encoding=30).peak == 125 + 30
+    assert replace(update, activations=30, shallow=4).peak == 125 + 30
+    assert replace(update, activations=30, shallow=25).peak == 125 + 10 + 25
+    for longest in ("encoding", "activations"):  # gradients of the micro-batch before are there already
+        assert replace(update, kept=True, **{longest: 30}).peak == 125 + 10 + 30
+
+
+def test_gradients_are_there_twice_where_they_are_sent_and_stay_between_micro_batches():
+    alone, sent = without_step(), without_step(launch=Launch(devices=2, cuda=True))
+    assert sent.gradients == 2 * alone.gradients
+    assert (alone.kept, without_step("training.accumulation=2").kept) == (False, True)
+
+
+def test_samples_one_by_one_are_as_many_micro_batches_as_each_device_has_samples():
+    [single] = [
+        change
+        for change in available_changes(micro_meta_model().recipe, Machine("cuda", 2, 1), False)
+        if change.name == "samples one by one"
+    ]
+    assert single.settings == ("training.accumulation=4",)
+
+
+def test_a_card_of_a_named_size_is_one_unless_more_are_asked_for(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 4)
+    assert machine_of(None, 80.0) == Machine("cuda", 1, 80 * GIB)
+    assert machine_of(8, 80.0) == Machine("cuda", 8, 80 * GIB)
+    assert machine_of(8, 80.0).usable == round(72 * GIB)
 
 
 def test_fsdp_divides_what_is_trained_by_the_number_of_processes():

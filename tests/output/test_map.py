@@ -121,10 +121,44 @@ def test_drawing_a_map_twice_gives_equal_files(tmp_path):
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
+def of_color(file, color):
+    """Rows and columns ``[dot, 2]`` of the dots of a picture that have about this colour."""
+    image = np.asarray(Image.open(file).convert("RGB")).astype(int)
+    return np.argwhere(np.abs(image - np.array(color)).max(-1) < 12)
+
+
 def near_color(file, color):
     """How many dots of a picture have about this colour."""
-    image = np.asarray(Image.open(file).convert("RGB")).astype(int)
-    return int((np.abs(image - np.array(color)).max(-1) < 12).sum())
+    return len(of_color(file, color))
+
+
+def test_what_lies_further_right_or_up_on_the_ground_is_drawn_there_to_scale(tmp_path):
+    draw_map(points(((-2, 0, 1), RED), ((2, 0, 0), BLUE)), UP, {}, tmp_path / "map.png")
+    down, right = of_color(tmp_path / "map.png", BLUE).mean(0) - of_color(tmp_path / "map.png", RED).mean(0)
+    metres_right, metres_up = (torch.tensor([4.0, 0, -1]).double() @ ground_axes(UP)[:2].T).tolist()
+    assert right / metres_right > 0
+    assert down == pytest.approx(-metres_up * right / metres_right, abs=3)
+
+
+def test_an_arrow_at_the_end_of_a_path_points_where_the_camera_looks(tmp_path):
+    nothing = MapPoints(torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.uint8))
+    ends = []
+    for sign in (-1, 1):
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, 2] = sign * ground_axes(UP)[0]
+        draw_map(nothing, UP, [pose[None]], tmp_path / "map.png")
+        ends.append(of_color(tmp_path / "map.png", (0xD8, 0x1B, 0x60))[:, 1].min())
+    left, right = ends
+    assert left < right
+
+
+def test_places_where_a_camera_was_stopped_are_crossed(tmp_path):
+    floor = points(((0, 0, 0), RED), ((3, 0, 0), RED))
+    stop = torch.eye(4, dtype=torch.float64)[None]
+    stop[0, 0, 3] = 1.5
+    draw_map(floor, UP, {}, tmp_path / "free.png")
+    draw_map(floor, UP, {}, tmp_path / "blocked.png", stop)
+    assert near_color(tmp_path / "blocked.png", (0, 0, 0)) > near_color(tmp_path / "free.png", (0, 0, 0)) + 50
 
 
 def test_candidates_are_drawn_in_colours_of_their_costs_under_the_chosen_one_and_the_goal(tmp_path):

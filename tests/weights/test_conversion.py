@@ -79,6 +79,14 @@ def test_a_tree_that_lacks_an_array_is_refused_with_its_name(tmp_path, name, tre
         converted(name, tree, tmp_path)
 
 
+def test_a_tree_with_fewer_convolutions_than_its_network_has_is_refused(tmp_path):
+    tree = i3d_tree()
+    for branch in tree.values():
+        del branch["Unit_5"]
+    with pytest.raises(CheckpointError, match="56 convolutions with a batch norm, I3D has 57"):
+        converted("i3d-kinetics-400", tree, tmp_path)
+
+
 def test_a_tree_of_another_network_is_refused(tmp_path):
     tree = alex_tree()
     tree["AlexNet_0"]["Conv_1"]["kernel"] = np.zeros((2, 1, 64, 5), np.float32)

