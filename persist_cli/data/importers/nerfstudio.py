@@ -90,8 +90,9 @@ def _read(file: Path) -> Mapping[str, Any]:
 def _lens(values: Mapping[str, Any], file: Path) -> Lens:
     """The lens by the values of a frame, on top of those of the whole file."""
     model = str(values.get("camera_model", PINHOLES[0]))
-    if model not in PINHOLES or values.get("is_fisheye"):
-        raise DataError(f"{file}: a {model} camera; undistort the images to a pinhole camera first")
+    kind = "fisheye" if values.get("is_fisheye") else model
+    if kind not in PINHOLES:
+        raise DataError(f"{file}: a {kind} camera; undistort the images to a pinhole camera first")
     try:
         fx, cx, cy = (float(values[name]) for name in ("fl_x", "cx", "cy"))
         fy = float(values.get("fl_y", fx))

@@ -322,7 +322,7 @@ def set_first(**changes: Any) -> Callable[[dict[str, Any]], None]:
         (set_values(frames=[]), "transforms.json: it lists no frames"),
         (set_values(frames=[{}]), "transforms.json: frame 0 has no file_path"),
         (set_values(camera_model="OPENCV_FISHEYE"), "a OPENCV_FISHEYE camera; undistort the images"),
-        (set_values(is_fisheye=True), "camera; undistort the images"),
+        (set_values(is_fisheye=True), "a fisheye camera; undistort the images"),
         (set_values(k4=0.1), "its intrinsics are none of OpenCV's pinhole camera"),
         (set_values(fl_x="wide"), "its intrinsics are not numbers"),
         (set_values(h=float("inf")), "its intrinsics are not numbers"),
