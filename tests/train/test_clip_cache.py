@@ -26,13 +26,12 @@ from persist_cli.memorize import sources
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.plugins import find_plugin, make_backbone
 from persist_cli.recipe import Recipe
-from persist_cli.train import clip_cache
+from persist_cli.train import clip_cache, tensor_cache
 from persist_cli.train.clip_cache import CachedClips, CacheKeys, ClipCache, ClipEncoder
 from persist_cli.train.tensor_cache import STALE, CacheSettings, TensorCache, cache_key
 from persist_cli.training_settings import DataSettings, TrainingSettings
 from tests.support.disk import file_limit
 from tests.support.micro_runs import MICRO, MICRO_SETTINGS, SIZE, equal_runs, losses, stage
-from tests.support.packages import install
 from tests.support.processes import start_persist
 
 FEW = "data.clips_per_trajectory=3"
@@ -173,6 +172,7 @@ def keys_of(walks, voxel):
     ).choose(0)
 
     def of(stage="2", budget=7, codec=0.0, precision="no", adapter=None, data=None, **changes):
+        device = changes.pop("device", "cpu")
         memory = replace(usual, **changes) if stage == "2" else None
         backbone.add_adapter(f"adapter-{len(backbone.adapters)}", 6, {"token_budget": budget} | (adapter or {}))
         factory = MemoryFactory.of(memory) if memory else None
@@ -180,7 +180,7 @@ def keys_of(walks, voxel):
         recipe = Recipe(stage, memory=memory, data=settings, training=TrainingSettings(precision=precision))
         with torch.no_grad():
             next(backbone.codec.parameters()).add_(codec)
-        return CacheKeys.of(recipe, backbone, factory, "cpu", recipe.training.precision).of_clip(frames)
+        return CacheKeys.of(recipe, backbone, factory, device, recipe.training.precision).of_clip(frames)
 
     return of
 
@@ -227,9 +227,11 @@ def test_tokens_that_are_kept_as_rendered_views_depend_on_the_rendering_the_code
     assert len({clip.tokens for clip in clip_keys}) == len(clip_keys)
 
 
-@pytest.mark.parametrize("newer", ["memory", "encoder"])
-def test_another_version_of_a_plugin_changes_the_key_of_tokens(keys_of, monkeypatch, newer):
+@pytest.mark.parametrize("newer", ["memory", "encoder", "code"])
+def test_another_version_or_code_of_a_plugin_changes_the_key_of_tokens(keys_of, monkeypatch, newer):
     before = keys_of()
+    if newer == "code":
+        monkeypatch.setattr(clip_cache, "code_of_others", lambda *named: dict(named))
 
     def find(kind, name):
         plugin = find_plugin(kind, name)
@@ -240,14 +242,13 @@ def test_another_version_of_a_plugin_changes_the_key_of_tokens(keys_of, monkeypa
     assert keys_of().tokens != before.tokens
 
 
-def test_an_edited_encoder_of_another_package_changes_the_key_of_tokens(keys_of, site):
-    code = "class Red(Encoder):\n    channels = 1\n    encode = lambda self, rgb: rgb[..., :1].float()\n"
-    code = f"from persist_cli.api.encoder import Encoder\n{code}"
-    install(site, "persist-red", "persist.encoders", "red = red_frames:Red", code)
-    before = keys_of(encoder="red", encoder_settings={})
-    (site / "red_frames.py").write_text(f"{code}# a change\n")
-    after = keys_of(encoder="red", encoder_settings={})
-    assert (after.latents, after.tokens == before.tokens) == (before.latents, False)
+def test_another_device_or_version_and_another_format_of_entries_change_all_keys(keys_of, monkeypatch):
+    clip_keys = [keys_of(), keys_of(device="cuda")]
+    for module, name in ((clip_cache, "__version__"), (tensor_cache, "FORMAT")):
+        monkeypatch.setattr(module, name, 9)
+        clip_keys.append(keys_of())
+    for part in ("latents", "tokens", "memory"):
+        assert len({getattr(keys, part) for keys in clip_keys}) == len(clip_keys)
 
 
 def test_another_format_of_tokens_changes_their_key_and_not_that_of_latents(keys_of, monkeypatch):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -11,6 +13,7 @@ from persist_cli.api.encoder import Encoder
 from persist_cli.data.store import Store, TrajectoryFile
 from persist_cli.memorize.kept_features import KeptFeatures, frame_digests
 from persist_cli.plugins import make_encoder
+from persist_cli.train.clip_cache import CacheKeys, ClipCache
 from persist_cli.train.feature_cache import FeatureCache
 from persist_cli.train.tensor_cache import CacheSettings, TensorCache
 
@@ -47,10 +50,10 @@ def reads(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return counts
 
 
-def feature_cache(folder: Path, file: TrajectoryFile, frames: int) -> FeatureCache:
+def feature_cache(folder: Path, file: TrajectoryFile, frames: int, **depends: str) -> FeatureCache:
     """A cache whose encoder has room for the features of some frames."""
     room = frames * PLAIN.encode(file.rgb([0])).nbytes
-    return FeatureCache(TensorCache(CacheSettings(folder, 1)), {}, KeptFeatures(Counting(None), room))
+    return FeatureCache(TensorCache(CacheSettings(folder, 1)), depends, KeptFeatures(Counting(None), room))
 
 
 def test_the_features_of_contexts_are_read_though_there_is_no_room_for_those_of_the_trajectory(file, tmp_path, reads):
@@ -68,6 +71,24 @@ def test_another_process_reads_the_same_features_and_encodes_none(file, tmp_path
     cache.bring(file, [5, 2])
     assert torch.equal(cache.encoder.encode(file.rgb([2, 5])), PLAIN.encode(file.rgb([2, 5])))
     assert (cache.encoder.encoder.frames, reads) == (0, [0, 2])
+
+
+def test_other_trajectories_and_what_else_features_depend_on_have_entries_of_their_own(walks, tmp_path, reads):
+    one, other = Store(walks)
+    for file, weights in ((one, "a"), (other, "a"), (one, "b")):
+        feature_cache(tmp_path, file, frames=6, weights=weights).bring(file, [0])
+    feature_cache(tmp_path, other, frames=6, weights="a").bring(other, [0])
+    assert reads == [0, 0, 0, 1]
+    assert len([*tmp_path.glob("*/*.safetensors")]) == 3
+
+
+def test_features_depend_on_the_encoder_and_not_on_the_memory_that_reads_them(tmp_path):
+    of_the_encoder = {"persist", "torch", "device", "encoder", "encoder_settings", "features", "packages"}
+    tokens = dict.fromkeys((*of_the_encoder, "memory", "settings", "budget", "noise", "kept", "precision"), "")
+    keys = CacheKeys(latents={}, tokens=tokens, whole_trajectories=False)
+    factory: Any = SimpleNamespace(encoder=KeptFeatures(Counting(None)))
+    features = ClipCache.of(TensorCache(CacheSettings(tmp_path, 1)), keys, factory).features
+    assert features.depends.keys() == of_the_encoder
 
 
 def test_features_that_a_context_has_do_not_leave_for_those_that_it_lacks(file, tmp_path, reads):

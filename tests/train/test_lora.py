@@ -76,6 +76,19 @@ def test_only_lora_and_the_new_parts_of_the_model_are_trained():
     assert all(".lora_A." in name or ".lora_B." in name for name in names - new)
 
 
+@pytest.mark.parametrize(("alpha", "scale"), [(None, 1.0), (8, 2.0)])
+def test_the_change_is_scaled_by_alpha_and_not_at_all_without_one(alpha, scale):
+    backbone = micro()
+    backbone.add_lora(Lora(rank=4, alpha=alpha))
+    layer = backbone.transformer.base.transformer_blocks[0].attn1.to_q
+    inputs = torch.randn(1, layer.in_features, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        plain = layer(inputs)
+        layer.lora_B["default"].weight.normal_(generator=torch.Generator().manual_seed(1))
+        change = inputs @ (layer.lora_B["default"].weight @ layer.lora_A["default"].weight).T
+        torch.testing.assert_close(layer(inputs), plain + scale * change)
+
+
 def test_a_run_holds_only_the_change_and_points_to_its_base(lora, stage1):
     files = {path.name for path in model_folder(lora).rglob("*.safetensors")}
     assert files == {"pytorch_lora_weights.safetensors", "world.safetensors"}

@@ -64,6 +64,16 @@ def test_steps_have_singular_values_near_one(shape):
     assert 0.5 < float(values.min()) < float(values.max()) < 1.5
 
 
+def test_a_matrix_that_no_gradient_reaches_yet_only_decays(monkeypatch):
+    monkeypatch.setattr("persist_cli.train.muon.has_bfloat16_tiles", lambda: False)
+    before = weights()["matrix"]
+    for gradient in (torch.zeros_like(before), None):  # as before layers that begin at zero; as where none was computed
+        matrix = nn.Parameter(before.detach().clone())
+        matrix.grad = gradient
+        Muon([matrix], 0.1, 0.01).step()
+        torch.testing.assert_close(matrix, before if gradient is None else before * (1 - 0.1 * 0.01))
+
+
 def test_its_state_goes_on_where_it_was_saved():
     whole, halves = weights(), weights()
     descend([MuonAndAdamW(whole.values(), 0.1, 0.0)], whole, range(4))

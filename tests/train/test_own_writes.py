@@ -13,16 +13,17 @@ from persist_cli.api.backbone import Clips
 from persist_cli.api.cameras import check_poses
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.geometry import pose_differences
-from persist_cli.api.observations import Origin
+from persist_cli.api.observations import Observations, Origin
 from persist_cli.checkpoints.load import adapter_memory, load_backbone
 from persist_cli.data.clips import ClipDataset, ClipPlan
 from persist_cli.data.store import Store
 from persist_cli.data.writing_noise import NO_ERRORS, WritingNoise
 from persist_cli.errors import DataError, RecipeError
 from persist_cli.memorize.factory import MemoryFactory
-from persist_cli.recipe import make_recipe
+from persist_cli.recipe import MemoryConfig, make_recipe
 from persist_cli.train.clip_cache import CachedClips, ClipEncoder
 from persist_cli.train.own_writes import OwnWrites
+from tests.support.micro_model import FRAMEWISE, micro, with_adapter
 from tests.support.micro_runs import SIZE, equal_runs, losses, stage
 
 OWN = ["data.own_writes=0.7", "data.own_warmup=1", "data.strides=[1]"]
@@ -113,6 +114,48 @@ def test_predicted_frames_are_written_where_the_cameras_of_their_segment_saw_the
         last = replace(cached.sample.clip, observations=seen[-1:], latents=None)
         assert torch.equal(own.sample.clip.latents.image, encoder.encode(last).image)
     assert written[0][1] != written[1][1]  # each sample has errors of its own
+
+
+def test_a_memory_imagines_what_each_segment_and_the_clip_will_see_before_it_is_read(walks, encoder, monkeypatch):
+    cached, kind, told = encoder.with_latents(CachedClips(chained_clips(walks), None)[0]), encoder.factory.kind, []
+    recall = kind.recall
+
+    def recorded(memory, paths, *more):
+        told.append(("read", paths[0]))
+        return recall(memory, paths, *more)
+
+    monkeypatch.setattr(kind, "foresee", lambda memory, paths: told.append(("imagined", paths[0])))
+    monkeypatch.setattr(kind, "recall", recorded)
+    (own,) = OwnWrites(encoder, NO_ERRORS).written([cached])
+    encoder.with_tokens(own)
+    assert [what for what, _ in told] == ["imagined", "read"] * 2
+    for (_, path), clip in zip(told, [*cached.sample.before * 2, *[cached.sample.clip] * 2], strict=True):
+        assert torch.equal(path.world_from_camera, clip.observations.cameras.world_from_camera)
+
+
+def test_each_segment_begins_with_the_frame_that_was_predicted_last_and_has_errors_of_its_own(walks, monkeypatch):
+    factory = MemoryFactory.of(MemoryConfig("voxel"))
+    encoder = ClipEncoder(with_adapter(micro(**FRAMEWISE)), factory, Accelerator(cpu=True), None)
+    plan = replace(chained_clips(walks, strides=(1,)).plan, frames=5, segments=3)
+    cached = encoder.with_latents(CachedClips(ClipDataset([walks], plan), None)[0])
+    given, ends, written = list[Clips](), (60, 190), Written()
+
+    def predict(clips: Clips) -> tuple[torch.Tensor, torch.Tensor]:
+        grey = ends[len(given)]
+        given.append(clips)
+        return torch.full((1, 5, SIZE, SIZE, 3), grey, dtype=torch.uint8), torch.full((1, 5, SIZE, SIZE), grey / 50)
+
+    monkeypatch.setattr(encoder.backbone, "predict_once", predict)
+    (own,) = OwnWrites(encoder, written).written([cached])
+    first, second = cached.sample.before
+    assert len({draw.item() for _, draw in written}) == 2
+    assert torch.equal(given[0].latents.image[0], first.latents.image)  # true: nothing was predicted before
+    for clip, latents, grey in ((second, given[1].latents[0], 60), (cached.sample.clip, own.sample.clip.latents, 190)):
+        rgb, depth = torch.full((1, SIZE, SIZE, 3), grey, dtype=torch.uint8), torch.full((1, SIZE, SIZE), grey / 50)
+        seen = replace(clip, observations=Observations(rgb, depth, clip.observations.cameras[:1]), latents=None)
+        assert torch.equal(latents.image, encoder.encode(seen).image)
+        assert torch.equal(latents.video, clip.latents.video)
+    assert [seeds for clips in given for seeds in clips.seeds] == [first.seed, second.seed]
 
 
 def test_other_samples_of_a_batch_are_left_alone(walks, encoder):

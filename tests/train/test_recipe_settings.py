@@ -5,15 +5,19 @@ from __future__ import annotations
 import pytest
 import torch
 from accelerate import Accelerator
+from diffusers.training_utils import EMAModel
 
+from persist_cli.api.stages import MemorySavings
 from persist_cli.data.augment import Augmentation
 from persist_cli.data.writing_noise import WritingNoise
 from persist_cli.errors import DataError
 from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.recipe import make_recipe
 from persist_cli.train.finetune import make_accelerator
+from persist_cli.train.optimizer import make_average, requested_savings
 from persist_cli.train.trainer import Trainer
 from persist_cli.train.training_loop import learning_rate
+from persist_cli.training_settings import TrainingSettings
 from tests.support.micro_model import FRAMEWISE, micro, with_adapter
 
 DATA = {
@@ -70,6 +74,30 @@ def test_each_setting_of_the_data_reaches_the_choice_of_clips(trainer):
 def test_segments_of_chained_samples_are_as_many_as_the_recipe_says(trainer):
     with pytest.raises(DataError, match="3 segments of a clip need 25 frames, the longest trajectory has 24"):
         trainer(own_writes=0.5, own_segments=3, strides=[1])
+
+
+def test_each_saving_of_memory_is_asked_of_the_backbone_by_its_own_setting():
+    gpu = torch.device("cuda")
+    assert requested_savings(TrainingSettings(), gpu) == MemorySavings()
+    for name in ("gradient_checkpointing", "compile", "vae_slicing"):
+        assert requested_savings(TrainingSettings(**{name: True}), gpu) == MemorySavings(**{name: True})
+    half = requested_savings(TrainingSettings(frozen_precision="bf16"), gpu)
+    assert half == MemorySavings(frozen=torch.bfloat16)
+
+
+def test_averaged_weights_are_moved_to_the_memory_of_the_processor_where_the_recipe_says_so(monkeypatch):
+    moved = []
+    monkeypatch.setattr(EMAModel, "to", lambda average, device: moved.append(device))
+    for device in ("model", "cpu"):
+        average = make_average([torch.nn.Parameter(torch.ones(2))], TrainingSettings(ema=0.7, ema_device=device))
+        assert average.decay == 0.7
+    assert moved == ["cpu"]
+
+
+def test_something_is_measured_on_batches_of_the_first_samples_each_of_them_once(trainer):
+    training = trainer(clips_per_trajectory=0)
+    seeds = [seed for batch in training.first_batches(3) for seed in batch.seeds]
+    assert seeds == [training.all_clips().choose(number).seed for number in range(6)]
 
 
 def test_each_step_is_taken_at_the_learning_rate_of_the_schedule(walks):
