@@ -4,13 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+from typing import Any
 
 import pytest
 import torch
 from diffusers import AutoencoderKLCogVideoX
 
-from persist_backbones.cogvideox.codec import batch_to_frames, fold_pixels, frames_to_batch, to_uint8, unfold_pixels
+from persist_backbones.cogvideox.codec import (
+    batch_to_frames,
+    decode_depth,
+    fold_pixels,
+    frames_to_batch,
+    to_uint8,
+    unfold_pixels,
+)
 from persist_backbones.cogvideox.cogvideox import CogVideoX
+from persist_backbones.cogvideox.diffusion import sample_generators
 from persist_cli.api.backbone import Sampling
 from persist_cli.doctor.tracing import fake_tensors
 from persist_cli.errors import CheckpointError
@@ -198,3 +207,52 @@ def test_a_framewise_codec_takes_clips_of_any_number_of_frames(frames: int) -> N
         micro(**FRAMEWISE, frames=1)
     with pytest.raises(CheckpointError, match="codec_window's frames must be at least 1, not 0"):
         micro(**FRAMEWISE, codec_window=[0, 32, 32])
+
+
+def numbered_clips(batch: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Clips of 3 frames, 6 rows and 5 columns, and depth of the number of each pixel."""
+    depth = torch.arange(90.0).reshape(1, 3, 6, 5).repeat(batch, 1, 1, 1)
+    return depth[..., None].expand(-1, -1, -1, -1, 3).to(torch.uint8), depth
+
+
+def test_windows_of_training_are_anywhere_in_a_clip_and_of_depth_where_those_of_colour_are() -> None:
+    rgb, depth = micro().codec.windows(*numbered_clips(120), (2, 4, 4), sample_generators(range(120)))
+    assert torch.equal(rgb.float(), depth[..., None].expand_as(rgb))
+    corners = {30 * frame + 5 * row + column for frame in (0, 1) for row in (0, 1, 2) for column in (0, 1)}
+    assert {*depth[:, 0, 0, 0].int().tolist()} == corners
+
+
+def test_the_window_of_a_sample_depends_on_its_seed_and_not_on_its_batch() -> None:
+    codec, seeds = micro().codec, range(4)
+    _, together = codec.windows(*numbered_clips(4), (1, 4, 4), sample_generators(seeds))
+    alone = [codec.windows(*numbered_clips(1), (1, 4, 4), sample_generators([seed]))[1] for seed in seeds]
+    assert torch.equal(together, torch.cat(alone))
+
+
+def test_each_window_of_training_is_drawn_with_the_seed_of_its_sample(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, clips, seeds = micro(codec_window=[1, 16, 16]), random_clips(2), []
+    windows = model.codec.windows
+
+    def recorded(*arguments: Any) -> Any:
+        seeds.extend(generator.initial_seed() for generator in arguments[-1])
+        return windows(*arguments)
+
+    monkeypatch.setattr(model.codec, "windows", recorded)
+    model(clips, "codec")
+    assert seeds == clips.seeds
+
+
+def test_the_codec_learns_depth_too() -> None:
+    model, clips = micro(), random_clips(1)
+    flat = dataclasses.replace(clips, depth=torch.full_like(clips.depth, 3.0))
+    one, other = (model(seen, "codec") for seen in (clips, flat))
+    assert one["psnr"] == other["psnr"]  # which is of the colours
+    assert (one["loss"] - other["loss"]).abs() > 1e-3
+
+
+def test_decoded_depth_is_that_of_the_mean_of_the_three_channels(monkeypatch: pytest.MonkeyPatch) -> None:
+    codec = micro().codec
+    channels = torch.tensor([-0.3, 0.1, 0.5]).view(1, 3, 1, 1, 1)
+    monkeypatch.setattr(codec, "images_of", lambda latents: channels.expand(len(latents), 3, 1, 2, 2))
+    _, depth = codec.decode_images(torch.zeros(1, 1, 2 * codec.channels, 1, 1))
+    torch.testing.assert_close(depth, decode_depth(torch.full((1, 1, 2, 2), 0.1)))

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from persist_backbones.cogvideox.diffusion import draw_timesteps, loss_weights, prediction_target, sample_generators
+from persist_backbones.diffusers_models import CogVideoXDDIMScheduler
 from persist_cli.api.backbone import Sampling
 from persist_cli.errors import CheckpointError, RecipeError
 from tests.support.micro_model import micro, random_clips, shaken
@@ -30,6 +31,13 @@ def test_the_loss_of_an_error_is_the_same_for_velocities_and_clean_latents(weigh
         weights = loss_weights(scheduler, STEPS, weighting, 5.0)
         losses[kind] = weights * (prediction - target).square().mean((1, 2, 3, 4))
     assert torch.allclose(losses["sample"].double(), losses["v_prediction"].double(), rtol=1e-3)
+
+
+def test_a_sample_is_trained_at_each_noise_level_from_hardly_any_to_noise_alone() -> None:
+    scheduler = CogVideoXDDIMScheduler(num_train_timesteps=4)
+    drawn = draw_timesteps(scheduler, sample_generators(range(80)))
+    assert torch.bincount(drawn).min() > 10
+    assert len(torch.bincount(drawn)) == 4
 
 
 def test_errors_of_channels_count_equally_or_by_what_they_change_in_pixels() -> None:

@@ -160,8 +160,9 @@ def test_teacher_and_target_see_the_same_memory():
         assert not torch.allclose(target, predict_clean(backbone, clips, nearer, states[::-1]))
 
 
-def test_the_teacher_steps_and_the_target_predicts_what_follows():
-    teacher, clips = shaken_micro(), random_clips(2)
+@pytest.mark.parametrize("guidance", [1.0, 3.0])
+def test_the_teacher_steps_with_its_guidance_and_the_target_predicts_what_follows_without(guidance):
+    teacher, clips = trained("canvas", prediction="sample", **FRAMEWISE), random_clips(2, random_tokens(2, 9))
     target = copy.deepcopy(teacher)
     shaken(target, 0.2)
     noised = teacher.add_noise(clips, sample_generators(clips.seeds), lambda _: torch.full((2,), 999))
@@ -169,9 +170,9 @@ def test_the_teacher_steps_and_the_target_predicts_what_follows():
     following = torch.full((2,), 499)
     levels = (noise_level(teacher.scheduler, timesteps) for timesteps in (noised.timesteps, following))
     with torch.no_grad():
-        stepped = ddim_step(predict_clean(teacher, clips, noised, states), noised.noisy, *levels)
-        nearer = noised._replace(noisy=stepped, timesteps=following)
-        learned = consistency_target(clips, noised, states, Distillation(Distill(levels=2), teacher, target))
+        stepped = ddim_step(predict_clean(teacher, clips, noised, states, guidance), noised.noisy, *levels)
+        nearer, settings = noised._replace(noisy=stepped, timesteps=following), Distill(levels=2, guidance=guidance)
+        learned = consistency_target(clips, noised, states, Distillation(settings, teacher, target))
         assert torch.equal(learned, predict_clean(target, clips, nearer, states))
 
 

@@ -264,6 +264,18 @@ def test_memory_guidance_of_weight_one_changes_nothing_and_more_moves_away_from_
     )
 
 
+@torch.no_grad()
+def test_memory_guidance_goes_from_no_memory_through_the_prediction_with_it():
+    backbone, clips = with_adapter(micro()), random_clips(tokens=random_tokens(2, 9))
+    shaken(backbone)
+    latents, image = backbone.codec.encode(clips.rgb, clips.depth), backbone.encode_first(clips)
+    conditions = backbone.conditions(clips, torch.full((2,), 500), backbone.memory_condition(clips))
+    without, plain, strong = (backbone.predict_guided(latents, image, conditions, weight) for weight in (0.0, 1.0, 3.0))
+    torch.testing.assert_close(without, predicted(backbone, clips, None))
+    torch.testing.assert_close(strong, without + 3 * (plain - without))
+    assert not torch.allclose(strong, plain, atol=1e-3)
+
+
 def test_shift_scale_and_gate_of_the_memory_are_its_own_and_those_of_the_video_are_the_videos():
     torch.manual_seed(0)
     block = MemoryBlock(video_channels=8, camera_channels=6, width=4, heads=2, ff_factor=1.0, time_channels=5)

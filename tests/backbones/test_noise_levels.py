@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from persist_backbones.cogvideox.diffusion import sample_generators
+from persist_backbones.cogvideox.diffusion import noise_like, sample_generators
 from persist_backbones.noise_levels import add_level, draw_levels, fill_with_noise
 from persist_cli.api.backbone import Clips, Sampling
 from persist_cli.api.checkpoint import find_checkpoint
@@ -48,6 +48,13 @@ def test_samples_that_share_a_generator_draw_in_their_order_however_many_threads
     alone = torch.randn(50_000, generator=generators()[1])
     assert torch.equal(drawn(1)[4], alone)
     assert all(torch.equal(drawn(8), drawn(1)) for _ in range(20))
+
+
+def test_noise_is_drawn_in_float32_and_rounded_to_the_precision_of_the_latents_alone() -> None:
+    drawn = torch.stack([torch.randn(3, 5, generator=generator) for generator in generators()])
+    for precision in (torch.float32, torch.bfloat16):
+        noise = noise_like(torch.zeros(2, 3, 5, dtype=precision), generators())
+        assert torch.equal(noise, drawn.to(precision))
 
 
 def test_the_noise_of_a_memory_and_what_is_drawn_next_do_not_depend_on_longer_ones_in_its_batch() -> None:

@@ -101,6 +101,13 @@ def test_in_bfloat16_a_clip_comes_out_near_that_of_float32(form):
     assert 0 < (coarse.frames - exact.frames).abs().mean() < 0.05
 
 
+def test_weights_of_half_precision_sample_latents_in_float32():
+    backbone, taken = trained().to(torch.bfloat16), []
+    backbone.sample(CLIPS, Sampling(2, memory_guidance=2.0), lambda step: taken.append(step.latents))
+    assert {latents.dtype for latents in taken} == {torch.float32}
+    assert all(len(latents.unique()) > len(latents.bfloat16().unique()) for latents in taken)
+
+
 @pytest.mark.parametrize("settings", [{}, FRAMEWISE], ids=["4 frames a latent", "framewise"])
 @FORMS
 def test_offloaded_weights_change_no_result(form, settings):
