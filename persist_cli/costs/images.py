@@ -78,9 +78,9 @@ class LpipsCost(ImageCost):
 
     def features(self, rgb: Frames) -> list[Tensor]:
         """Return the network's taps of the image."""
-        least = lpips.LpipsAlex.least_size
-        if min(rgb.shape[1:3]) < least:
-            raise PersistError(f"cost {self.name!r}: LPIPS takes images of at least {least} px, not {rgb.shape[2]}")
+        least, size = lpips.LpipsAlex.least_size, min(rgb.shape[1:3])
+        if size < least:
+            raise PersistError(f"cost {self.name!r}: LPIPS takes images of at least {least} px, not {size}")
         with exact_inference():
             return lpips.features(self._weights, lpips.ALEX, rgb.to(network_device()))
 

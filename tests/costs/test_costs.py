@@ -90,8 +90,10 @@ def test_costs_without_weights_say_how_they_are_fetched(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("cost", ["lpips"], indirect=True)
-def test_images_too_small_for_lpips_are_one_line(cost):
-    futures = futures_at((0, 0, 0), size=24)
+@pytest.mark.parametrize(("height", "width"), [(24, 24), (24, 40), (40, 24)])
+def test_images_too_small_for_lpips_are_one_line(cost, height, width):
+    futures = futures_at((0, 0, 0), size=40)
+    futures = replace(futures, rgb=futures.rgb[:, :, :height, :width])
     with pytest.raises(PersistError, match="LPIPS takes images of at least 31 px, not 24"):
         cost.measure(futures, image_goal(futures.rgb[0, 0]), GROUND)
 
