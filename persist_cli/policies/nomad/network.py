@@ -58,7 +58,7 @@ class NomadNetworkSettings:
         farthest: spacings to the farthest goal; goals of other trajectories are said to be as far.
         nearest: spacings to the goal above which waypoints are learned; up to it they may lead past the goal.
         negatives: share of the samples whose goal is a frame of another trajectory.
-        still: metres; waypoints that end nearer than this are not learned. A place cannot tell a turn on the spot.
+        still: metres; waypoints that all lie nearer than this are not learned. A place cannot tell a turn on the spot.
         masked: share of the samples whose goal is masked.
         distance_weight: weight of the distance's squared error; that of the noise has the rest.
         place_weight: weight of the error of where the goal lies; 0 as published, where nothing predicts it.
