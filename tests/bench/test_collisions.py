@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -67,6 +68,17 @@ def test_a_verdict_uses_no_frame_that_comes_after_it(walk):
     cut = map_verdicts(walk, walk.frames[:12])[: len(early)]
     assert map_verdicts(walk, walk.frames)[: len(early)] == cut
     assert frame_verdicts(walk, walk.frames)[: len(early)] == frame_verdicts(walk, walk.frames[:12])[: len(early)]
+
+
+def test_a_verdict_of_a_frame_knows_that_frame_alone_and_one_of_a_map_its_present_frame_too(walk):
+    alone = [
+        replace(walk, frames=walk.frames[one.frame : one.frame + 1], attempts=(replace(one, frame=0),))
+        for one in walk.attempts
+    ]
+    expected = [map_verdicts(one, one.frames)[0] for one in alone]
+    assert frame_verdicts(walk, walk.frames) == expected
+    assert len(set(expected)) > 1
+    assert map_verdicts(walk, walk.frames) != expected
 
 
 def test_precision_and_recall_are_shares_of_counted_steps(walk):

@@ -128,6 +128,17 @@ def test_the_geodesic_cost_leads_round_a_wall_and_counts_unknown_ground_more():
     assert over_unknown[:, 0].tolist() == pytest.approx([6.0, 3.0], abs=0.3)
 
 
+def test_the_geodesic_cost_to_one_goal_is_not_taken_for_that_to_another_or_on_another_map():
+    goals = [Goal(None, torch.tensor([x, 0.55, 1.2]), "room") for x in (3.0, 1.5)]
+    ground = room_with_wall()
+    open_ground = replace(ground, states=torch.full_like(ground.states, int(Cover.FREE)))
+    near, far, cost = futures_at((1.0, 0.55, 1.2)), futures_at((9.0, 0.55, 1.2)), make_cost("geodesic", {})
+    for goal, known in ((goals[0], ground), (goals[1], ground), (goals[0], ground), (goals[0], open_ground)):
+        for futures in (near, far):
+            alone = make_cost("geodesic", {}).measure(futures, goal, known)
+            assert cost.measure(futures, goal, known).tolist() == alone.tolist()
+
+
 def test_the_geodesic_cost_takes_the_radius_of_the_body_unless_it_has_its_own():
     states = torch.full((40, 40), int(Cover.FREE), dtype=torch.uint8)
     states[:18, 20] = states[22:, 20] = int(Cover.OCCUPIED)  # a gap of 0.4 m between walls

@@ -145,6 +145,33 @@ def test_another_walk_of_the_same_scene_is_as_far_as_it_is(tmp_path):
     assert unknown.read(choice).distance == 20
 
 
+def test_moments_and_the_goals_of_other_walks_are_any_that_there_are(tmp_path):
+    for name in ("one", "two", "three"):
+        write_straight(tmp_path, name=name)
+    samples = PolicySampleDataset([tmp_path], dataclasses.replace(FORM, negatives=0.5), 0)
+    drawn = [samples.choose(number) for number in range(600)]
+    assert {one.present for one in drawn} == set(range(24 - 8))
+    others = [one for one in drawn if one.file != one.goal_file]
+    assert {one.goal for one in others} == set(range(24))
+    assert len({(one.file, one.goal_file) for one in others}) == 6
+    assert len({one.seed for one in drawn}) > 590
+
+
+def test_the_direct_way_to_another_walk_begins_at_place_and_heading_of_the_present_camera(tmp_path):
+    for number, word in enumerate(("ll" + "f" * 12, "f" * 12)):
+        write_actions(tmp_path / str(number), word)
+    form = dataclasses.replace(FORM, farthest=20)
+    samples = PolicySampleDataset([tmp_path / "0", tmp_path / "1"], form, 0, detour=2.0)
+    choice = SampleFrames(file=0, present=2, goal_file=1, goal=2, mirrored=False, seed=0)
+    assert samples.read(choice).distance == 4  # two turns back and two steps, at most twice as many, by two frames
+
+
+def test_frames_of_another_scene_are_far_also_where_walks_wander(walks):
+    samples = PolicySampleDataset([walks], dataclasses.replace(FORM, farthest=50), 0, detour=2.0)
+    sample = samples.read(SampleFrames(file=0, present=4, goal_file=1, goal=4, mirrored=False, seed=0))
+    assert (sample.distance, sample.leads_to_goal) == (50, False)
+
+
 def test_data_in_which_nothing_is_reached_directly_is_refused_in_one_line(tmp_path):
     folder = write_actions(tmp_path, "lr" * 12)
     with pytest.raises(DataError, match=r"1000 moments drawn, and none leads .* within 2 times .*; raise data.detour"):

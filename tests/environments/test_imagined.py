@@ -70,6 +70,14 @@ def test_each_episode_begins_with_the_memory_as_it_was_given(settings):
     assert all(np.array_equal(one["rgb"], two["rgb"]) for one, two in zip(first, again, strict=True))
 
 
+def test_each_episode_has_noise_of_its_own(settings):
+    env, seeds = make(settings), set()
+    for seed in (0, 1, None):
+        env.reset(seed=seed)
+        seeds.add(env.unwrapped.scenes._agents[0].seed)
+    assert len(seeds) == 3
+
+
 def test_without_writing_the_given_frames_are_remembered_and_nothing_that_is_imagined(settings):
     writes, reads = make(settings), make(settings, write=False)
     given = writes.unwrapped.scenes.first.memory.figures()

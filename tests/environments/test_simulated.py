@@ -128,16 +128,41 @@ def test_after_a_reset_that_is_refused_there_is_no_episode_to_go_on_with():
 
 
 def test_the_way_round_a_wall_is_longer_than_the_line_through_it():
-    ways, lines = make(), make(distance="straight")
-    longer = [ways.reset(seed=seed)[1]["distance"] - lines_of(lines, ways) for seed in range(8)]
+    ways = make()
+    longer = [ways.reset(seed=seed)[1]["distance"] - straight_metres(ways) for seed in range(8)]
     assert min(longer) > -1e-9
     assert max(longer) > 0.5
 
 
-def lines_of(lines: gymnasium.Env, ways: gymnasium.Env) -> float:
-    """The straight distance to the goal of an episode whose reward goes by the way."""
-    attempt = ways.unwrapped.attempt
+def straight_metres(env: gymnasium.Env) -> float:
+    """The straight distance to the goal."""
+    attempt = env.unwrapped.attempt
     return float(np.linalg.norm(attempt.goal.position.numpy() - attempt.now.world_from_camera[:3, 3]))
+
+
+def test_episodes_are_drawn_in_all_houses_and_at_all_headings():
+    env, houses, headings = make(distance="straight").unwrapped, set(), []
+    for seed in range(6):
+        env.reset(seed=seed)
+        houses.add(env.scenes.houses[0]._seed)
+        headings.append(env.scenes.houses[0].simulator.agent[1])
+    assert len(houses) == 2
+    assert len(set(headings)) == 6
+
+
+def test_straight_metres_lead_through_walls_also_where_goals_are_drawn():
+    env = make(distance="straight", goal_distance=[4.0, 4.4])
+    for seed in range(4):
+        distance = env.reset(seed=seed)[1]["distance"]
+        assert distance == pytest.approx(straight_metres(env))
+        assert 4.0 <= distance <= 4.4
+
+
+def test_a_vector_shows_what_each_of_its_agents_sees():
+    vector = gymnasium.make_vec(NAME, num_envs=2, render_mode="rgb_array", **HOUSES)
+    seen = vector.reset(seed=3)[0]["rgb"]
+    assert all(np.array_equal(*pair) for pair in zip(vector.render(), seen, strict=True))
+    assert not np.array_equal(*seen)
 
 
 def test_a_vector_of_houses_is_equal_to_single_ones_with_its_seeds():

@@ -164,3 +164,14 @@ def test_the_sky_is_no_obstacle():
     seen = DepthAndGoal(space)({"depth": depth, "goal": torch.zeros(1, 2)})[0, :-2] * 5
     assert seen[:-1].tolist() == pytest.approx([3.0] * (len(seen) - 1))
     assert seen[-1] >= 3
+
+
+def test_the_network_sees_the_nearest_thing_in_each_part_of_the_upper_half_and_the_goal():
+    space = gymnasium.make(**TRUE, observe_goal="place").observation_space
+    height, width = space["depth"].shape
+    depth = torch.full((2, height, width), 4.0)
+    depth[:, height // 2 :] = 1.0  # the floor
+    depth[1, 3, 3 * width // 16 + 1] = 2.0
+    seen = 5 * DepthAndGoal(space)({"depth": depth, "goal": torch.tensor([[0.0, 0.0], [3.0, -1.5]])})
+    assert seen[0].tolist() == pytest.approx([4.0] * 16 + [0.0, 0.0])
+    assert seen[1].tolist() == pytest.approx([4.0] * 3 + [2.0] + [4.0] * 12 + [3.0, -1.5])

@@ -52,6 +52,12 @@ def test_a_chunk_of_actions_ends_with_the_first_that_reaches_the_goal():
     assert episode.info()["walked"] == pytest.approx(2.0)
 
 
+def test_a_chunk_of_actions_is_one_step_of_the_episode():
+    episode = attempt(chunk=3)
+    episode.advance([view(0, 0, 15, 3.0), view(0, 0, 30, 3.0), view(0, 0.25, 30, 2.8)])
+    assert episode.steps == 1
+
+
 def test_rewards_of_an_episode_sum_to_the_way_that_was_made():
     episode = attempt(step_cost=0.0)
     lefts = (2.5, 2.8, 2.9, 1.7, 2.2)

@@ -155,6 +155,58 @@ def test_practice_follows_from_its_seed_and_does_not_change_the_memory(place, wa
     assert all(tensor.equal(before[name]) for name, tensor in memory.tensors().items())
 
 
+def test_walks_of_one_seed_differ_and_do_not_depend_on_the_batch(place, walks):
+    views, policies = Store(walks)[0].read(range(12)).observations, (make_policy("random", {}),) * 2
+    settings = [replace(SETTINGS, actions=4, batch=batch) for batch in (1, 2)]
+    found = [[walk.actions for walk in practise(place, policies, views, one, 1)] for one in settings]
+    assert found[0] == found[1]
+    assert len(set(found[0])) == SETTINGS.walks
+
+
+def test_frames_of_a_walk_have_the_action_after_each_and_a_blocked_one_leaves_none(place, walks):
+    later = Store(walks)[0].read(range(4, 7)).observations
+    walker = walker_towards(place, walks, 1.0, "forward")
+    start = walker.seen
+    walker.saw(("left", "forward", "right"), later, [True, False, True])
+    walk = walker.walk()
+    assert (walk.actions, walk.blocked, walker.taken) == (("left", "right"), 1, 3)
+    frames = list(walk.frames())
+    assert [(frame.action, frame.timestamp) for frame in frames] == [("left", 0), ("right", 1), (None, 2)]
+    expected = [start.rgb[0], later.rgb[0], later.rgb[2]]
+    assert all(torch.from_numpy(frame.rgb).equal(rgb) for frame, rgb in zip(frames, expected, strict=True))
+
+
+def test_a_policy_that_practises_sees_the_last_frames_and_is_asked_for_as_many_actions_as_are_done(place, walks):
+    asked = []
+
+    class Looks(Policy):
+        frames, longest = 3, 8
+
+        def propose(self, situation, horizon, count, generator) -> list[tuple[str, ...]]:
+            asked.append((situation.seen.rgb, horizon))
+            return [("left",) * horizon] * count
+
+    views = Store(walks)[0].read(range(12)).observations
+    settings = replace(SETTINGS, actions=16, explore=0.0, proposals=1)
+    walker = Walker(place, (Looks(None), Proposes("right")), views, ground_of(views, place), settings, 1)
+    walker.saw(("left",) * 5, views[2:7], [True] * 5)
+    assert walker.decide() == ("left",) * SETTINGS.execute
+    ((seen, horizon),) = asked
+    assert horizon == SETTINGS.execute
+    assert seen.equal(views.rgb[4:7])
+
+
+def test_each_walk_is_imagined_with_noise_of_its_own_and_ways_are_as_wide_as_the_body(place, walks):
+    place.first.body = Body(radius=0.35)
+    views, random = Store(walks)[0].read(range(12)).observations, make_policy("random", {})
+    walkers = [Walker(place, (random, random), views, None, SETTINGS, seed) for seed in range(3)]
+    seeds = [walker.sampling_seed for walker in walkers]
+    place.begin([walker.seen for walker in walkers], seeds)
+    assert [agent.seed for agent in place.world.agents] == seeds
+    assert len(set(seeds)) == 3
+    assert {walker.cost.settings.radius for walker in walkers} == {0.35}
+
+
 @pytest.mark.parametrize("nowhere", [float("inf"), None])  # as measured, and as JSON has it
 def test_figures_of_episodes_are_means_of_those_that_are_finite(nowhere):
     records = [{"figures": {"spl": spl, "end_metres": metres}} for spl, metres in ((0.1, 2.0), (0.2, nowhere))]

@@ -154,6 +154,71 @@ def test_observed_frames_count_before_the_points_of_a_memory():
     assert cover_at(mapper.map(), -1.0, 0.0) == Cover.FREE
 
 
+def points_at(*heights: float, **more: object) -> MapPoints:
+    """Points above each other, one metre along -x."""
+    positions = torch.tensor([[-1.0, height, 0.0] for height in heights], dtype=torch.float64)
+    return MapPoints(positions, torch.zeros(len(heights), 3, dtype=torch.uint8), **more)
+
+
+@pytest.mark.parametrize(
+    ("height", "rise", "cover"),
+    [
+        (0.7, 0.0, Cover.OCCUPIED), (0.3, 0.5, Cover.FREE), (0.5, 0.5, Cover.OCCUPIED), (0.0, 0.0, Cover.FREE),
+        (-2.0, 0.0, Cover.UNKNOWN), (1.8, 0.0, Cover.UNKNOWN),
+    ],
+)  # fmt: skip
+def test_a_point_of_a_memory_is_in_the_way_where_its_lower_end_is_at_the_height_of_the_body(height, rise, cover):
+    mapper = GroundMapper(UP, BODY)
+    mapper.add_points(points_at(height, rise=rise), floor=0.0)
+    assert cover_at(mapper.map(), -1.0, 0.0) == cover
+
+
+def test_a_point_of_a_memory_blocks_half_of_its_square_and_frees_all_of_it():
+    for height, near, far in ((0.7, Cover.OCCUPIED, Cover.UNKNOWN), (0.0, Cover.FREE, Cover.FREE)):
+        mapper = GroundMapper(UP, BODY)
+        mapper.add_points(points_at(height, spread=0.4), floor=0.0)
+        assert (cover_at(mapper.map(), -0.92, 0.0), cover_at(mapper.map(), -0.83, 0.0)) == (near, far)
+
+
+def test_imagined_points_of_a_memory_give_way_to_observed_ones():
+    mapper = GroundMapper(UP, BODY)
+    origins = torch.tensor([Origin.IMAGINED, Origin.OBSERVED], dtype=torch.uint8)
+    mapper.add_points(points_at(0.7, 0.0, origins=origins), floor=0.0)
+    assert cover_at(mapper.map(), -1.0, 0.0) == Cover.FREE
+
+
+def test_as_many_imagined_frames_for_as_against_make_a_place_free_and_it_can_be_forgotten():
+    pose, place = look((0.0, 1.25, 0.0), 90.0, 0.0), torch.tensor([[-1.0, 0.0]], dtype=torch.float64)
+    mapper, frame = GroundMapper(UP, BODY), seen(pose, origin=Origin.IMAGINED)
+    mapper.add(replace(frame, depth=torch.full_like(frame.depth, 1.0)))
+    forgetful = mapper.copy()
+    mapper.add(frame)
+    assert cover_at(mapper.map(), -1.0, 0.0) == Cover.FREE
+    assert cover_at(forgetful.map(), -1.0, 0.0) == Cover.OCCUPIED
+    forgetful.forget(place, 0.5)
+    assert cover_at(forgetful.map(), -1.0, 0.0) == Cover.UNKNOWN
+
+
+def test_where_an_imagined_frame_was_taken_is_free_unless_an_observed_one_shows_a_thing_there():
+    wall = seen(look((1.0, 1.25, 0.0), 90.0, 0.0))
+    imagined = seen(look((0.0, 1.25, 0.0), 0.0, 0.0), origin=Origin.IMAGINED).without_depth()
+    alone, both = GroundMapper(UP, BODY), GroundMapper(UP, BODY)
+    alone.add(imagined)
+    both.add(replace(wall, depth=torch.full_like(wall.depth, 1.0)))
+    both.add(imagined)
+    assert cover_at(alone.map(), 0.0, 0.0) == Cover.FREE
+    assert cover_at(both.map(), 0.0, 0.0) == Cover.OCCUPIED
+
+
+def test_nothing_that_is_too_far_or_above_the_body_is_in_its_way():
+    frame = seen(look((0.0, 1.25, 0.0), 90.0, 0.0))  # looks along -x
+    far, above = torch.full_like(frame.depth, 6.5), torch.zeros_like(frame.depth)
+    above[:, 0] = 2.0
+    for depth in (far, above):
+        ground = ground_from_frames(replace(frame, depth=depth), UP, BODY)
+        assert not (ground.states == Cover.OCCUPIED).any()
+
+
 def test_a_body_has_the_camera_height_that_its_data_set_tells():
     assert body_of(ROOM.info) == Body()
     told = body_of(replace(ROOM.info, source={"camera_height": 1.7}))
@@ -170,6 +235,13 @@ def test_a_collision_makes_what_is_right_before_the_body_occupied():
     assert cover_at(mapper.map(), 0.0, 0.0) == cover_at(mapper.map(), -0.5, 0.0) == Cover.FREE
     mapper.add_collision(frames.cameras[0], -0.25)
     assert cover_at(mapper.map(), 0.25, 0.0) == Cover.OCCUPIED
+
+
+def test_a_collision_blocks_half_of_the_bodys_width():
+    mapper = GroundMapper(UP, BODY)
+    mapper.add_collision(seen(look((0.0, 1.25, 0.0), 90.0, 0.0)).cameras[0], 0.25)  # looks along -x
+    covers = [cover_at(mapper.map(), -0.25, z) for z in (-0.18, -0.09, 0.0, 0.09, 0.18)]
+    assert covers == [Cover.UNKNOWN, *[Cover.OCCUPIED] * 3, Cover.UNKNOWN]
 
 
 def test_a_body_is_as_high_as_the_camera_that_collected_its_data():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -60,6 +61,19 @@ def test_a_place_too_near_to_a_wall_is_not_as_near_as_what_is_behind_it(beside):
     assert metres(distances, beside, -1.5) == pytest.approx(0.6 - beside, abs=0.1)
 
 
+def test_a_place_inside_something_takes_the_shorter_way_out_of_it():
+    distances = distances_to(room_with_wall(), place(1.0, 0.0), radius=0.2)
+    assert metres(distances, 0.0, 0.0) == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_place_deep_inside_something_has_no_way():
+    ground = room_with_wall()
+    ground.states[:, 40:] = int(Cover.OCCUPIED)  # from x = 0 on
+    distances = distances_to(ground, place(-1.0, 0.0), radius=0.2)
+    assert metres(distances, 0.2, 0.0) == pytest.approx(1.2, abs=0.1)
+    assert math.isinf(metres(distances, 0.4, 0.0))
+
+
 def test_of_several_places_each_square_is_as_far_as_from_the_nearest_alone():
     places = torch.tensor([[x / 20 + 0.525, -0.975] for x in range(10)], dtype=torch.float64)
     together = distances_to(room_with_wall(), places, radius=0.2).metres
@@ -101,3 +115,10 @@ def test_a_place_that_is_no_place_or_far_from_all_is_refused(x: float) -> None:
         check_within_reach(
             "the goal", torch.tensor([x, 0.0, 0.0]).double(), room_with_wall(), [torch.zeros(1, 3).double()]
         )
+
+
+def test_a_place_near_anything_that_is_known_is_within_reach() -> None:
+    far, agent, nowhere = place(60.0, 0.0), torch.zeros(1, 3).double(), GroundMap.empty(UP)
+    goal = torch.cat([far[0], torch.zeros(1).double()])
+    check_within_reach("the goal", goal, nowhere, [agent, torch.tensor([[55.0, 0.0, 1.0]]).double()])
+    check_within_reach("the goal", goal, replace(room_with_wall(), origin=(53.0, -2.0)), [agent])

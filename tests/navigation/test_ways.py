@@ -37,6 +37,14 @@ def test_an_agent_at_the_wall_may_walk_along_it_and_away_from_it_but_not_into_it
     assert verdicts([((0.82, 0.0), (0.82, 0.25))]) == [FREE]
 
 
+def test_who_touches_a_thing_may_pass_it_by_nearer_but_not_through_it():
+    ground = ground_with_wall()
+    ground.states[:] = int(FREE)
+    ground.states[22, 22] = int(OCCUPIED)  # its middle is 0.18 m from the start
+    starts, ends = torch.zeros(2, 2).double(), torch.tensor([[0.25, 0.0], [0.25, 0.2]]).double()
+    assert way_is_free(ground, starts, ends, 0.2).tolist() == [FREE, OCCUPIED]  # by 0.125 m, or 0.02 m
+
+
 def test_a_way_along_a_wall_at_the_very_radius_is_free_wherever_the_origin_lies():
     states = torch.full((40, 60), int(FREE), dtype=torch.uint8)
     states[14] = int(OCCUPIED)
@@ -46,6 +54,22 @@ def test_a_way_along_a_wall_at_the_very_radius_is_free_wherever_the_origin_lies(
         place = torch.tensor([x, 2 * x], dtype=torch.float64) + start
         assert bool(walkable(ground, 0.2)[10, 20])
         assert way_is_free(ground, place[None], place[None] + torch.tensor([0.25, 0.0]), 0.2).tolist() == [FREE]
+
+
+def test_a_way_over_unknown_ground_between_free_places_is_unknown():
+    ground = ground_with_wall()
+    ground.states[:, 24] = int(UNKNOWN)  # from 0.2 to 0.25 m
+    starts, ends = torch.tensor([[0.1, 0.0]]).double(), torch.tensor([[0.35, 0.0]]).double()
+    assert way_is_free(ground, starts, ends, 0.2).tolist() == [UNKNOWN]
+
+
+def test_what_lies_beyond_the_end_of_a_way_is_not_in_the_way():
+    ground = ground_with_wall()
+    starts, ends = torch.tensor([[0.0, 0.025]]).double(), torch.tensor([[0.25, 0.025]]).double()
+    for column, cover in ((28, OCCUPIED), (29, FREE)):  # its middle at 0.425 or 0.475 m
+        ground.states[:] = int(FREE)
+        ground.states[20, column] = int(OCCUPIED)
+        assert way_is_free(ground, starts, ends, 0.2).tolist() == [cover]
 
 
 def test_a_wall_between_start_and_end_blocks_a_long_way():

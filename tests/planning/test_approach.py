@@ -11,7 +11,7 @@ from persist_cli.api.cameras import Cameras
 from persist_cli.api.cost import Cost, Futures
 from persist_cli.api.ground import GroundMap
 from persist_cli.api.policy import Goal
-from persist_cli.planning.approach import SIDES, best_approach, straight_ways, ways_aside
+from persist_cli.planning.approach import SIDES, best_approach, glances, straight_ways, ways_aside
 from persist_cli.planning.futures import WorldFutures
 from persist_cli.planning.judge import Judge
 from persist_cli.plugins import make_cost
@@ -44,6 +44,13 @@ def test_the_best_place_is_reached_in_the_middle_of_a_way(model) -> None:
     goal, ground = Goal(None, place, agent.info.scene), GroundMap.empty(agent.info.world_up)
     judge = Judge(WorldFutures(model, ground), make_cost("distance", {}), goal, ground, "best")
     assert best_approach(judge, agent.info.vocabulary, 6) == ("left", "forward", "forward")
+
+
+def test_glances_turn_to_each_side_and_back() -> None:
+    both = walking_actions(0.25, 15.0)
+    one = ActionVocabulary(tuple(action for action in both.actions if action.name != "right"))
+    assert glances(both) == [("left", "right"), ("right", "left")]
+    assert glances(one) == [()]
 
 
 def test_ways_aside_turn_back_beyond_the_first_heading() -> None:

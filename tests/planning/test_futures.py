@@ -96,6 +96,13 @@ def test_a_move_into_a_known_wall_stays_where_it_is(model):
     assert torch.equal(WorldFutures(model, ground, Body()).imagine(names, "best", False).walks[0].poses, walk.poses)
 
 
+def test_futures_say_which_of_the_judged_frames_followed_a_blocked_action(model):
+    futures = WorldFutures(model, wall_before(model, 0.6), Body())
+    names = [["forward"] * 3, ["forward", "left"]]
+    every, last = (futures.imagine(names, over, sees=False).futures.free.tolist() for over in ("best", "last"))
+    assert (every, last) == ([[True, True, False], [True, True, True]], [[False], [True]])
+
+
 def test_blocked_actions_show_what_a_rollout_with_a_body_does_and_cost_no_frames(model, monkeypatch):
     ground, imagined = wall_before(model, 0.6), []
     futures = WorldFutures(model, ground, Body())
@@ -128,3 +135,17 @@ def test_the_simulator_shows_what_is_there_and_the_agent_stands_where_it_stood()
         )
     with pytest.raises(DataError, match="action 'drop' changes the scene"):
         SimulatorFutures(world).imagine([["drop"]], "last")
+
+
+def test_the_simulator_as_the_model_stops_at_walls_and_is_left_as_it_was():
+    world = make_world(height=SIZE, width=SIZE)
+    world.open_scene(5)
+    put_somewhere(world)
+    stood, names = world.agent, ["forward"] * 40
+    walk = SimulatorFutures(world).imagine([names], "last", sees=False).walks[0]
+    with pytest.raises(DataError, match="action 'drop' changes the scene"):
+        SimulatorFutures(world).imagine([["left", "drop"]], "last")
+    assert world.agent == stood
+    assert [world.act(name) for name in names] == walk.free.tolist()
+    assert not walk.free.all()
+    torch.testing.assert_close(walk.poses[-1], torch.from_numpy(world.observe().world_from_camera))

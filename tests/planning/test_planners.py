@@ -1,6 +1,8 @@
 """Planners on the poses that candidates lead to, where the best plan is known."""
 
 import dataclasses
+import itertools
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -103,6 +105,13 @@ def test_a_view_a_step_or_a_turn_beside_one_that_was_looked_at_comes_last_too(ju
     assert all(candidate.cost >= LAST for candidate in beside)
 
 
+def test_of_a_way_over_a_view_that_was_looked_at_the_best_other_frame_counts(judge, model):
+    looked = model.agents[0].cameras_after(AHEAD).world_from_camera[-1:].double()
+    over, turning = judge(looked=looked, over="best").judge([AHEAD, ("left",) * 4], 1)
+    assert (over.cost, over.best) == (pytest.approx(0.4), 2)  # the frame after it is too near
+    assert turning.cost == pytest.approx(0.8)
+
+
 def test_frames_that_nobody_imagined_are_not_counted_but_use_up_a_budget(judge, situation):
     one = judge(budget=Budget(8))
     plan = Rank(make_policy("random", {}), RankSettings(4, 5)).plan(situation, one, seeded())
@@ -141,6 +150,20 @@ def test_what_is_left_of_a_plan_is_judged_again_beside_new_proposals(judge, situ
     assert len(planner.plan(situation, judge(), seeded(2)).candidates[0].actions) == 4  # nothing was left
 
 
+def test_a_plan_that_is_kept_takes_the_place_of_one_proposal_of_the_first_round(judge, situation, monkeypatch):
+    random, one, rounds = make_policy("random", {}), judge(), []
+    planner, alone = (Rank(random, RankSettings(4, count, rounds=2, keep=True)) for count in (3, 1))
+    kept = planner.plan(situation, judge(), seeded()).actions
+    own = one.judge
+    monkeypatch.setattr(one, "judge", lambda names, number: rounds.append(list(names)) or own(names, number))
+    planner.plan(situation, one, seeded(1))
+    assert [len(names) for names in rounds] == [3, 3]
+    assert rounds[0][0] == kept != rounds[1][0]
+    only = alone.plan(situation, judge(), seeded()).actions
+    first = alone.plan(situation, judge(), seeded(1)).candidates
+    assert [candidate.actions for candidate in first if candidate.round == 1] == [only]
+
+
 def test_later_rounds_draw_what_the_elites_did(judge, situation):
     plan = Cem(CemSettings(horizon=4, candidates=60, rounds=5, smoothing=0.1)).plan(situation, judge(), seeded())
     means = [
@@ -169,6 +192,21 @@ def test_a_policy_proposes_half_of_the_first_round(judge, situation):
     assert plan.best.cost == pytest.approx(0.0, abs=1e-6)
     alone = Cem(settings).plan(situation, judge(), seeded())
     assert AHEAD not in [candidate.actions for candidate in alone.candidates]
+
+
+def test_distributions_follow_how_often_each_action_was_drawn_among_the_elites(judge, situation):
+    planner = Cem(CemSettings(horizon=1, candidates=20, rounds=1, elites=0.5, smoothing=0.25))
+    planner.plan(situation, judge(), seeded())
+    names, uniform = ["forward", "left", "right"], torch.full((1, 3), 1 / 3, dtype=torch.float64)
+    elites = sorted(draw(uniform, names, 20, seeded()), key=lambda one: one != ("forward",))[:10]
+    expected = 0.25 * uniform + 0.75 * frequencies(elites, names, uniform)
+    assert planner._last.probabilities[0, 0] == pytest.approx(float(expected[0, 0]))
+
+
+def test_what_a_policy_proposes_of_other_actions_is_not_searched(judge, situation):
+    settings = CemSettings(horizon=2, candidates=6, rounds=1, actions=("left", "right"))
+    plan = Cem(settings, make_policy("straight", {})).plan(situation, judge(), seeded())
+    assert {name for one in plan.candidates for name in one.actions} == {"left", "right"}
 
 
 def test_frequencies_are_shares_of_each_place():
@@ -233,6 +271,20 @@ def test_a_budget_of_seconds_ends_a_plan_after_its_first_batch_at_least(judge, s
     assert (len(plan.candidates), plan.exhausted) == (5, True)
 
 
+def test_a_budget_of_seconds_leaves_out_what_would_take_longer_than_what_is_left(judge, monkeypatch):
+    clock = itertools.count()  # each batch takes a second
+    monkeypatch.setattr("persist_cli.planning.judge.time", SimpleNamespace(monotonic=lambda: next(clock)))
+    one = judge(budget=Budget(seconds=3.25), batch=2)
+    one.judge([*itertools.product(("left", "right"), repeat=4)], 1)
+    assert (len(one.judged), one.seconds, one.exhausted) == (6, 3, True)
+
+
+def test_each_batch_says_how_many_actions_it_had(judge):
+    actions = []
+    judge(batch=2, on_batch=actions.append).judge([AHEAD, AHEAD[:2], ("left",)], 1)
+    assert actions == [6, 1]
+
+
 @pytest.mark.parametrize(("budget", "cause"), [({"frames": 0}, "0 frames"), ({"seconds": 0.0}, "0 seconds")])
 def test_a_budget_of_nothing_is_refused(budget, cause):
     with pytest.raises(PersistError, match=f"a budget of {cause}"):
@@ -264,6 +316,33 @@ def test_a_cost_that_is_nan_is_one_line(judge):
     broken = dataclasses.replace(judge(), cost=Undefined(None))
     with pytest.raises(PersistError, match=r"cost 'undefined' of 'left\*2 forward' is NaN \(1 of 1 candidates\)"):
         broken.judge([["left", "left", "forward"]], 1)
+
+
+class UndefinedAtFirst(Undefined):
+    """A cost that is not defined for the first frame of a candidate."""
+
+    def measure(self, futures, goal, ground):
+        costs = torch.ones(futures.free.shape)
+        costs[:, 0] = torch.nan
+        return costs
+
+
+def test_a_cost_that_is_nan_in_one_frame_of_several_is_said_too(judge):
+    broken = dataclasses.replace(judge(over="best"), cost=UndefinedAtFirst(None))
+    with pytest.raises(PersistError, match=r"is NaN \(2 of 2 candidates\)"):
+        broken.judge([["left", "left"], ["right", "forward"]], 1)
+
+
+def test_a_policy_that_needs_another_goal_is_refused(situation):
+    class Shown(type(make_policy("random", {}))):
+        reads = frozenset({"image"})
+
+    policy = Shown(make_policy("random", {}).settings)
+    policy.name = "shown"
+    with pytest.raises(PersistError, match="policy 'shown' needs a goal with image; this goal has none"):
+        check_goal(situation.goal, make_cost("distance", {}), policy)
+    seen = dataclasses.replace(situation.goal, rgb=situation.seen.rgb[0])
+    check_goal(seen, make_cost("distance", {}), policy)
 
 
 def test_costs_and_policies_that_need_another_goal_are_refused(situation):

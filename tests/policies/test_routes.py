@@ -10,6 +10,7 @@ from persist_cli.api.policy import Situation
 from persist_cli.errors import RecipeError
 from persist_cli.navigation.ways import way_is_free
 from persist_cli.plugins import make_policy
+from persist_cli.policies.shortest_path import Walker
 from tests.policies.test_shortest_path import open_ground, parted_ground, places_along, situation
 from tests.support.room_worlds import BODY
 from tests.support.rooms import UP
@@ -28,6 +29,15 @@ def test_routes_end_on_both_sides_of_a_wall_and_are_never_blocked():
     ends = torch.stack([places[-1] for places in ways])
     assert 4 <= int((ends[:, 0] > 0.1).sum()) <= 20
     assert float(ends.std(0).min()) > 0.4
+
+
+def test_places_are_neither_too_near_nor_farther_than_all_steps_together():
+    now = situation(open_ground(), None)
+    walker = Walker(now)
+    places = make_policy("routes", {"nearest": 0.5})._places(walker, 1.0)
+    metres = (places - walker.place).norm(dim=1)
+    assert 0.4 < float(metres.min()) < 0.6
+    assert 0.9 < float(metres.max()) <= 1.0 + 1e-9
 
 
 def test_routes_keep_the_horizon_and_follow_from_the_generator():

@@ -103,6 +103,16 @@ def test_where_all_is_seen_and_the_goal_is_an_image_it_stops():
     assert proposals(situation(ground, None)) == [()]
 
 
+def test_a_hole_in_the_known_ground_is_no_frontier_unless_it_is_long_enough():
+    ground = open_ground()
+    for edge in (ground.states[0], ground.states[-1], ground.states[:, 0], ground.states[:, -1]):
+        edge[:] = int(Cover.OCCUPIED)
+    ground.states[40, 60] = int(Cover.UNKNOWN)
+    assert proposals(situation(ground, None), frontier=0.5) == [()]
+    [actions] = proposals(situation(ground, None), frontier=0.3)
+    assert "forward" in actions
+
+
 def test_further_proposals_are_other_ways_to_the_goal_and_the_same_for_one_generator():
     now = situation(open_ground(), (1.5, -1.5), at=(-1.5, 1.5))
     several = proposals(now, count=6)

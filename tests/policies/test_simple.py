@@ -7,13 +7,14 @@ import dataclasses
 import pytest
 import torch
 
-from persist_cli.api.actions import walking_actions
+from persist_cli.api.actions import Action, ActionVocabulary, walking_actions
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.ground import Cover, GroundMap, ground_axes
 from persist_cli.api.observations import Observations
 from persist_cli.api.policy import Goal, Situation
 from persist_cli.errors import DataError, PersistError, RecipeError
 from persist_cli.plugins import make_policy
+from persist_cli.policies.simple import gait
 from tests.support.rooms import UP, Room, look
 
 
@@ -108,3 +109,15 @@ def test_policies_refuse_vocabularies_that_they_cannot_walk_by():
     for name in ("random", "straight"):
         with pytest.raises(PersistError, match="known: stay"):
             make_policy(name, {}).propose(dataclasses.replace(here, info=still), 1, 1, draw())
+
+
+def test_a_gait_is_the_longest_step_straight_ahead_and_the_smallest_turn_to_each_side():
+    moves = {
+        "short": (0.1, 0), "long": (0.3, 0), "back": (-0.5, 0), "curve": (0.9, 5), "wide": (0, 30), "left": (0, 10),
+        "right": (0, -20), "far": (0, -45), "stay": (0, 0),
+    }  # fmt: skip
+    vocabulary = ActionVocabulary(
+        tuple(Action(name, forward=forward, turn=turn) for name, (forward, turn) in moves.items())
+    )
+    ahead, turns = gait(vocabulary)
+    assert (ahead.name, [turn.name for turn in turns]) == ("long", ["left", "right"])

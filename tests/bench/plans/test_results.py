@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import math
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 
-from persist_cli.bench.plans.results import COLUMNS, compared_with, row_figures
+from persist_cli.bench.plans.plan_bench import PlanningBench
+from persist_cli.bench.plans.results import COLUMNS, compared_with, groups, row_figures, table_json
 from persist_cli.episodes.navigation_metrics import WalkRecord, closed_loop_figures
 from persist_cli.episodes.rows import RowChoice
+from persist_cli.episodes.stop_rules import StopAtPlace, StopThreshold, StopThresholds
 from persist_cli.evaluate.statistics import Draws
 
 
@@ -46,3 +52,41 @@ def test_figures_of_weights_that_were_fetched_while_the_benchmark_was_stopped_ar
     records = [{"closed": None, "open": {"figures": figures}} for figures in (before, after)]
     assert set(row_figures(records, Draws.of([0, 1]))) == {"ate"}
     assert set(row_figures([records[1]] * 2, Draws.of([0, 1]))) == {"ate", "sim", "lpips"}
+
+
+def episodes_of(*kinds: tuple[int, int, bool]) -> list[Any]:
+    """Return stand-ins of episodes of scenes, bins, and goals in sight or hidden."""
+    return [SimpleNamespace(scene=scene, bin=number, in_sight=in_sight) for scene, number, in_sight in kinds]
+
+
+def test_kinds_of_episodes_are_all_each_bin_in_sight_or_hidden_and_each_of_both() -> None:
+    kinds = groups(episodes_of((0, 4, True), (0, 8, False), (1, 4, False)))
+    assert {kind.name: kind.numbers for kind in kinds} == {
+        "all episodes": (0, 1, 2), "in sight": (0,), "hidden": (1, 2), "4 actions": (0, 2), "4 actions, in sight": (0,),
+        "4 actions, hidden": (2,), "8 actions": (1,), "8 actions, hidden": (1,),
+    }  # fmt: skip
+
+
+def test_intervals_are_over_scenes_not_over_episodes() -> None:
+    rows = RowChoice(names=("random",), memories=(), policy=None, goal="image", cem_candidates=60).rows()
+    records = {"random": [{"closed": {"figures": {"success": number % 2}}, "open": None} for number in range(12)]}
+    for scenes, has_interval in ((2, False), (6, True)):
+        episodes = episodes_of(*((number % scenes, 4, True) for number in range(12)))
+        table = table_json(next(groups(episodes)), episodes, rows, records)
+        figure = table["rows"]["random"]["success"]
+        assert (table["scenes"], figure["mean"]) == (scenes, 0.5)
+        assert math.isfinite(figure["low"] if figure["low"] is not None else math.nan) == has_interval
+
+
+def test_agents_that_imagine_approach_from_farther_than_others_stop() -> None:
+    thresholds = StopThresholds(StopThreshold(0.1, 1.0, 0, 0), StopThreshold(0.4, 2.0, 0, 0))
+    rows = RowChoice(
+        names=("random", "rank-8", "shortest-path"), memories=("none",), policy=None, goal="image", cem_candidates=60
+    ).rows()
+    for approach, value in ((True, 0.4), (False, 0.1)):
+        plan = SimpleNamespace(planning=SimpleNamespace(approach=approach))
+        bench: Any = SimpleNamespace(plan=plan, cost=None, thresholds=thresholds)
+        rules = {row.name: PlanningBench.stop_rule(bench, row) for row in rows}
+        assert rules["random"].threshold == 0.1
+        assert rules["rank-8, none"].threshold == value
+        assert isinstance(rules["shortest-path"], StopAtPlace)

@@ -12,7 +12,7 @@ from persist_cli.api.meta_device import without_weights
 from persist_cli.api.policy_network import PolicySamples
 from persist_cli.errors import CheckpointError, RecipeError
 from persist_cli.io.settings import parse_settings
-from persist_cli.policies.nomad.efficientnet import EncoderSettings
+from persist_cli.policies.nomad.efficientnet import Block, EfficientNet, EncoderSettings
 from persist_cli.policies.nomad.matcher import Matcher
 from persist_cli.policies.nomad.network import NomadNetwork, NomadNetworkSettings, squashed
 from tests.support.micro_policies import micro_network, random_samples
@@ -36,6 +36,16 @@ def test_a_masked_goal_changes_nothing_when_its_image_changes():
     second = network.condition(samples.seen, samples.goal.flip(0), masked)
     assert torch.equal(first[masked], second[masked])
     assert not torch.isclose(first[~masked], second[~masked]).all(1).any()
+
+
+def test_the_goal_is_compared_with_the_present_frame_in_the_colours_of_imagenet():
+    network, samples = micro_network(), random_samples()
+    given: list[torch.Tensor] = []
+    network.goal_encoder.register_forward_pre_hook(lambda module, images: given.extend(images))
+    network.condition(samples.seen, samples.goal, NO)
+    mean, deviation = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
+    for image, part in zip((samples.seen[:, -1], samples.goal), given[0].chunk(2, dim=1), strict=True):
+        assert torch.allclose(part.permute(0, 2, 3, 1), (image / 255 - mean) / deviation, atol=1e-6)
 
 
 def test_the_condition_is_the_mean_over_the_tokens_that_are_not_masked():
@@ -125,10 +135,33 @@ def test_waypoints_that_do_not_lead_to_the_goal_or_stand_still_are_not_learned()
     assert torch.equal(network(elsewhere, "policy")["noise_error"], network(changed, "policy")["noise_error"])
     still = dataclasses.replace(samples, waypoints=moved)  # 0.42 m
     assert torch.equal(network(elsewhere, "policy")["noise_error"], network(still, "policy")["noise_error"])
+    moved[0, 1] = 0.4  # goes there and back
+    back = dataclasses.replace(samples, waypoints=moved)
+    assert not torch.equal(network(elsewhere, "policy")["noise_error"], network(back, "policy")["noise_error"])
 
 
-def test_the_distance_of_a_masked_goal_is_not_learned():
-    assert micro_network(masked=1.0)(random_samples(), "policy")["distance_error"] == 0
+def test_of_a_masked_goal_neither_the_distance_nor_the_place_is_learned():
+    losses = micro_network(masked=1.0, place_weight=0.5, matcher=MATCHER)(random_samples(), "policy")
+    assert losses["distance_error"] == losses["place_error"] == 0
+
+
+def test_every_noise_level_is_learned_and_so_many_goals_are_masked():
+    masked, levels, noise = micro_network(masked=0.3)._draw(range(400))
+    assert set(levels.tolist()) == set(range(10))
+    assert float(masked.double().mean()) == pytest.approx(0.3, abs=0.08)
+    assert float(noise.std()) == pytest.approx(1.0, abs=0.05)
+
+
+def test_blocks_are_left_out_in_training_the_later_the_more_often_and_count_more_where_they_are_not():
+    torch.manual_seed(0)
+    settings = parse_settings(EncoderSettings, {"stem": 8, "stages": [[1, 8, 4, 1, 3]], "head": 16}, "the encoder")
+    assert [block.drop for block in EfficientNet(settings, 3, 0.2).blocks] == pytest.approx([0.0, 0.05, 0.1, 0.15])
+    block, image = Block(8, (1, 8, 1, 1, 3), 0.25), torch.randn(64, 8, 4, 4)
+    added = block.eval()(image) - image
+    changes = (block.train()(image) - image).detach()
+    left_out = changes.flatten(1).abs().amax(1) == 0
+    assert 4 <= int(left_out.sum()) <= 30
+    assert torch.allclose(changes[~left_out], added[~left_out] / 0.75, atol=1e-5)
 
 
 def test_what_is_random_about_a_sample_follows_from_its_seed_whatever_the_batch():

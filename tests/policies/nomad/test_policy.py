@@ -122,6 +122,17 @@ def test_a_short_past_and_images_of_another_size_will_do(policy_run, situation):
     assert policy.propose(with_goal(situation, situation.goal.rgb.repeat(2, 2, 1)), 4, 1, draw())
 
 
+def test_of_the_past_it_sees_frames_that_are_as_far_apart_as_in_training(policy_run, situation):
+    policy = open_policy(str(policy_run), {"stop": 0})  # sees the present frame, and the second before it
+    rgb, changes = situation.seen.rgb, []
+    for number in range(3):
+        changed = rgb.clone()
+        changed[number] = 255 - changed[number]
+        seen = dataclasses.replace(situation.seen, rgb=changed)
+        changes.append(policy.distance(dataclasses.replace(situation, seen=seen)) != policy.distance(situation))
+    assert changes == [True, False, True]
+
+
 def test_fewer_denoising_steps_are_possible_and_more_are_refused(policy_run, situation):
     assert open_policy(str(policy_run), {"steps": 2, "stop": 0}).propose(situation, 8, 2, draw())
     with pytest.raises(RecipeError, match=r"steps 11; .* has 10 noise levels"):
