@@ -13,6 +13,8 @@ from persist_cli.plugins import OWN, find_plugin
 
 SHOWN: Final = 12  # digits of a hash
 
+MODULES: Final = (*SOURCE_SUFFIXES, *EXTENSION_SUFFIXES)
+
 
 def code_of(kind: str, name: str) -> str | None:
     """Package, version and a hash of the code of a plugin; ``None`` for one of persist's own.
@@ -45,10 +47,13 @@ def _sources(module: str) -> tuple[Path, list[Path]]:
     names = module.split(".")
     for end in range(1, len(names) + 1):
         spec = importlib.util.find_spec(".".join(names[:end]))
-        if spec is None or not spec.has_location or spec.origin is None:  # a namespace, which other packages share
+        if spec is None:  # loading the plugin says so
+            break
+        if not spec.has_location or spec.origin is None:  # a namespace, which other packages share
             continue
-        home, file = Path(spec.origin).parent, Path(spec.origin)
-        return home, [file] if spec.submodule_search_locations is None else [
-            path for path in home.rglob("*.*") if path.name.endswith((*SOURCE_SUFFIXES, *EXTENSION_SUFFIXES))
-        ]
+        file = Path(spec.origin)
+        if spec.submodule_search_locations is None:
+            return file.parent, [file]
+        modules = (path for path in file.parent.rglob("*.*") if path.name.endswith(MODULES))
+        return file.parent, [*modules]
     return Path(), []

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
+import shutil
+
 import pytest
 
 from persist_cli.plugin_code import code_of, code_of_others
@@ -54,6 +57,12 @@ def test_persists_own_plugins_are_told_by_their_version_alone(memory):
     assert code_of("memory", "voxel") is None
     others = code_of_others(("memory", "voxel"), ("memory", "last"), ("encoder", "gone"))
     assert others == {"memory last": code_of("memory", "last"), "encoder gone": "not installed"}
+
+
+def test_a_plugin_whose_module_is_gone_is_told_by_its_package_alone(memory, site):
+    shutil.rmtree(memory)
+    importlib.invalidate_caches()
+    assert (code_of("memory", "last") or "").startswith("persist-last 1.2, code ")
 
 
 def test_an_evaluation_does_not_go_on_with_an_edited_memory(persist, site, walks, held_out, stage1, tmp_path):
