@@ -86,6 +86,7 @@ ALONE: Final[dict[str, tuple[str, GoalKind | None, bool]]] = {
     "shortest-path": ("shortest-path", "place", True),
     "shortest-path-no-walk": ("shortest-path", "place", False),
     "shortest-path-image": ("shortest-path", "image", True),
+    "shortest-path-image-no-walk": ("shortest-path", "image", False),
     RETRIEVAL: ("shortest-path", "place", True),
 }
 """Rows without imagination: the policy, what it is told of the goal (``None``: what the cost reads), and whether it is

@@ -36,6 +36,8 @@ ALONE: Final = f"policy,policy-walk,{CLASSICAL}"
 
 BLIND: Final = "random,straight"
 
+NO_WALK: Final = "shortest-path-no-walk,shortest-path-image-no-walk"  # as much is known as where nothing is remembered
+
 CEM: Final = "--candidates 30 --rounds 2 --dtype bfloat16"  # 60 candidates of 8 actions, within 3 s on two cores
 
 MEMORIES: Final = "simulator,voxel,none"
@@ -86,10 +88,10 @@ def commands(figures: PlanningFigures) -> Iterator[str]:
 
     trained, policy, closed = figures.trained, figures.policy, "--loops closed"
     for rows in ("rank-16", "rank-8,rank-16,rank-16-walk"):
-        yield bench("episodes", trained, f"{BLIND},{ALONE},shortest-path-no-walk,{rows}", "trained")
+        yield bench("episodes", trained, f"{BLIND},{ALONE},{NO_WALK},{rows}", "trained")
     yield bench("hidden", trained, "policy,rank-16", "hidden", closed)
     yield bench("hidden", trained, "policy,cem-policy", "cem", f"{closed} {CEM}")
-    yield bench("gap", trained, f"policy,{CLASSICAL},rank-16", "gap", closed)
+    yield bench("gap", trained, f"policy,{CLASSICAL},{NO_WALK},rank-16", "gap", closed)
     yield bench("episodes", policy, f"{ALONE},rank-8,rank-16,rank-16-walk", "lpips", LOOP)
     for choice in ("no-keep", "no-approach", "no-explore"):
         yield bench("episodes", policy, "rank-16", choice, f"{LOOP} {closed} --{choice}")

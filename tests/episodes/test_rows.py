@@ -41,6 +41,8 @@ def test_the_classical_planner_is_told_the_place_whatever_the_others_see() -> No
     assert (place.goal, image.goal) == ("place", "image")
     assert place.walk
     assert image.walk
+    names = ("shortest-path-no-walk", "shortest-path-image-no-walk")
+    assert [(row.goal, row.walk) for row in choice(*names).rows()] == [("place", False), ("image", False)]
 
 
 def test_the_goals_place_can_be_retrieved_from_the_given_frames() -> None:
