@@ -416,3 +416,12 @@ def test_where_a_thing_hid_the_floor_behind_it_up_to_the_wall_the_view_has_no_ho
     gone = edited(room, Remove(**box_of(room, "table#1")))
     holes = ~first_surfaces(gone, camera, sheets=sheet_cells(gone, 0)).hit
     assert not bool((holes & drawn.hit).any())
+
+
+def test_the_foot_of_a_wall_that_a_removed_thing_hid_is_known():
+    grid = cell_room()
+    grid.classes[1, 5, 1] = BOX
+    grid.origins[0, 5, :2] = 0
+    foot = edited(grid, Remove(low=(-9.0, 0.1, -9.0), high=(-0.2, 1.0, 9.0)))
+    assert bool(foot.known[0, 5, :2].all())
+    assert (int(foot.classes[0, 5, 1]), int(foot.classes[0, 5, 0])) == (WALL, FLOOR)

@@ -311,3 +311,11 @@ def test_a_window_is_turned_to_look_ahead_before_the_model_sees_it_and_back_afte
     kept = before.known & (before.classes != SOLID)
     assert torch.equal(contents(scene, before)[0][kept], before.classes[kept])
     assert torch.equal(contents(scene, before)[1][before.solid], before.colors[before.solid])
+
+
+def test_over_a_thin_floor_a_camera_sees_that_the_foot_of_a_wall_is_unknown():
+    room = cell_room()
+    camera = camera_at(room, (2, 2, 5), (13, 2, 0), size=256)
+    assert not sees_unknown(room, camera, 6.0, 0)
+    room.origins[13, :, 0] = 0
+    assert sees_unknown(room, camera, 6.0, 0)

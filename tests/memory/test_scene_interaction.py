@@ -398,3 +398,14 @@ def test_what_was_picked_up_is_not_seen_any_more():
     without = scene.read(camera, 2000).features.argmax(1)
     assert BOX in with_box.tolist()
     assert BOX not in without.tolist()
+
+
+def test_what_nobody_saw_under_an_overhanging_thing_stays_unknown_but_for_the_floor():
+    scene, grid = empty_scene(), cell_room()
+    grid.classes[9, 4:6, 2] = BOX
+    grid.origins[9, 5, :2] = 0
+    scene.add(grid)
+    assert do(scene, "pick_up")
+    assert classes(scene)[9, 4:6, 2].tolist() == [FREE, FREE]
+    assert int(classes(scene)[9, 5, 0]) == FLOOR
+    assert origins(scene)[9, 5, :2].tolist() == [CellOrigin.IMAGINED, 0]

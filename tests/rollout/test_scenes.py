@@ -4,11 +4,13 @@ import pytest
 import torch
 
 from persist_cli.api.cells import CellOrigin
+from persist_cli.api.ground import Body
 from persist_cli.data.clips import interactions_of
 from persist_cli.rollout.camera_path import CameraPath
 from persist_cli.rollout.rollout import clips_along
+from persist_cli.rollout.surroundings import Surroundings
 from persist_cli.rollout.world_model import Agent
-from tests.support.cell_rooms import BOX_CELLS, WALL, camera_at, cell_room
+from tests.support.cell_rooms import BOX, BOX_CELLS, WALL, camera_at, cell_room
 from tests.support.drawn_scenes import DrawnWalls, empty_scene
 from tests.support.room_worlds import BODY
 from tests.support.scene_worlds import scene_world, unseen_world
@@ -129,3 +131,33 @@ def test_imagined_frames_do_not_change_the_scene():
     scene = room_scene()
     world, _ = walk(scene, "left left forward")
     assert torch.equal(world.agents[0].scene.cells.classes, scene.cells.classes)
+
+
+def test_a_wide_agent_puts_things_down_farther_away():
+    away = []
+    for radius in (0.2, 0.7):
+        world = scene_world(room_scene(), camera_at(cell_room(), *BEFORE_BOX, size=64))
+        agent = world.agents[0]
+        world.agents = [Agent(agent.memory, body=Body(radius))]
+        world.reset([agent.now], [agent.info])
+        [result] = world.step([["pick_up", "drop"]])
+        assert bool(result.free.all())
+        grid = cell_room()
+        held = world.agents[0].scene.cells.box(grid.corner, grid.shape).classes == BOX
+        away.append(0.25 * (int(held.nonzero()[0, 0]) - 4))
+    assert away == [0.5, 1.0]
+
+
+def test_what_frames_showed_where_cells_have_become_known_is_forgotten():
+    whole = room_scene()
+    agent = scene_world(whole, camera_at(cell_room(), *BEFORE_BOX, size=64)).agents[0]
+    unsure, gone = cell_room(), cell_room()
+    unsure.origins[BOX_CELLS] = unsure.classes[BOX_CELLS] = gone.classes[BOX_CELLS] = 0
+    before, after = empty_scene(), empty_scene()
+    before.add(unsure)
+    after.add(gone)
+    known = Surroundings(BODY, agent.now, agent.info, before)
+    start, end = (camera_at(gone, (cell, 4, 5), (12, 4, 5)).world_from_camera[0] for cell in (4, 9))
+    assert known.blocks(start, end)  # the frame shows the box
+    known.changed(after, before.cells)
+    assert not known.blocks(start, end)

@@ -3,6 +3,7 @@
 import json
 import struct
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -72,3 +73,20 @@ def test_faces_between_blocks_are_not_in_the_mesh():
 
 def test_a_map_without_a_cell_has_no_blocks():
     assert [len(part) for part in DetailTree(solid_block(2)[:0]).select(10)] == [0]
+
+
+def test_of_a_long_row_blocks_grow_step_by_step_away_from_the_view():
+    numbers = np.arange(512)[:, None] * np.array([1, 0, 0])
+    none = np.zeros(512, np.uint8)
+    cells = DrawnCells(numbers * 0.5, np.zeros((512, 3), np.uint8), none, none, (0.5, 0.5, 0.5), np.eye(3))
+    parts = DetailTree(cells).select(160, np.zeros(3))
+    widths = [part.size[0] for part in parts]
+    assert widths == [0.5 * 2**number for number in range(len(parts))]
+    assert len(parts) >= 3
+    farthest = [float(part.centers[:, 0].max() + part.size[0] / 2) for part in parts]
+    assert [second / first for first, second in pairwise(farthest[:-1])] == pytest.approx([2.0] * (len(parts) - 2), 0.2)
+
+
+def test_blocks_of_no_known_origin_are_grey():
+    cells = replace(solid_block(1), origins=np.zeros(1, np.uint8))
+    assert painted(cells, "origin").tolist() == [[128, 128, 128]]

@@ -6,6 +6,7 @@ import json
 import math
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,8 @@ from persist_cli.api.cameras import Cameras
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.scene_edits import Copy, Move
-from persist_cli.bench.scenes.edit_part import MOVED, draw_change, is_visible, shows
+from persist_cli.bench.scenes import edit_part
+from persist_cli.bench.scenes.edit_part import AROUND, MOVED, EditTrial, draw_change, is_visible, judge_edit, shows
 from persist_cli.bench.scenes.journal import SceneJournal
 from persist_cli.bench.scenes.rendering import RendererLoader, rendered_rows
 from persist_cli.bench.scenes.return_part import (
@@ -39,6 +41,7 @@ from persist_cli.bench.scenes.scene_bench import (
     prepare,
     read_views,
 )
+from persist_cli.editing.locality import edited_pixels
 from persist_cli.evaluate.statistics import Draws
 from persist_cli.io.files import read_tensors, write_tensors
 from persist_cli.metrics.fvd import LEAST_FRAMES, LEAST_VIDEOS, Fvd
@@ -238,3 +241,20 @@ def test_pieces_of_a_walk_begin_after_the_given_frame() -> None:
     firsts = [int(piece[0, 0, 0, 0]) for piece in pieces(rgb)]
     assert (firsts, {len(piece) for piece in pieces(rgb)}) == ([1, LEAST_FRAMES + 1], {LEAST_FRAMES})
     assert len(pieces(rgb[:-1])) == 1
+
+
+def test_what_changes_right_beside_an_edit_is_no_change_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    house, edited = two_rooms(), two_rooms()
+    edited.classes[9:11, 7:9, 1:3] = TABLE
+    lens = torch.tensor([[16.0, 0, 16], [0, 16, 16], [0, 0, 1]])
+    camera = Cameras(camera_in(house)[None], lens[None], 32, 32)
+    before, after = (SimpleNamespace(cells=grid, copy=lambda: None) for grid in (house, edited))
+    trial = EditTrial(SimpleNamespace(scene="house"), camera, before, after, "insert")
+    rim = edited_pixels(house, edited, camera, AROUND) & ~edited_pixels(house, edited, camera)
+    frames = [torch.zeros(1, 32, 32, 3, dtype=torch.uint8) for _ in range(3)]
+    frames[1][rim] = frames[2][rim] = 200
+    drawn = iter(frames)
+    monkeypatch.setattr(edit_part, "rendered", lambda *arguments: next(drawn))
+    judged = judge_edit(None, None, trial, 0)
+    assert int(rim.sum()) > 20
+    assert (judged["outside"], judged["noise"]) == (0.0, 0.0)

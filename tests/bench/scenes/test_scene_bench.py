@@ -12,13 +12,18 @@ import pytest
 import torch
 
 from persist_cli.api.actions import walking_actions
+from persist_cli.api.cells import Box
+from persist_cli.api.ground import Body
 from persist_cli.bench.scenes.journal import file_name
 from persist_cli.bench.scenes.plan_pictures import class_colors
 from persist_cli.bench.scenes.run_scene_bench import against_baselines
-from persist_cli.bench.scenes.walk_part import Wanderer, house_shares, new_cells, window_values
+from persist_cli.bench.scenes.walk_part import Wanderer, house_shares, new_cells, walk, window_values
 from persist_cli.checkpoints.scene_models import find_scene_model
 from tests.conftest import Persist
 from tests.support.cell_houses import FORM, two_rooms, write_cell_houses
+from tests.support.cell_rooms import UP as ROOM_UP
+from tests.support.cell_rooms import camera_at, cell_room
+from tests.support.drawn_scenes import DrawnWalls, empty_scene
 from tests.support.micro_runs import run_persist
 
 SMALL = ("--radius", 2, "--seeds", 2, "--set", "memory.steps=1")
@@ -201,3 +206,17 @@ def test_new_cells_agree_or_not_only_where_the_true_house_knows_them() -> None:
     shares = house_shares([SimpleNamespace(house=house)], len(FORM.palette))
     counts = torch.bincount(house.classes[:20].flatten().long(), minlength=len(FORM.palette)).numpy()
     assert shares == pytest.approx(counts / counts.sum())
+
+
+def test_a_step_that_a_wall_stops_counts_for_no_metres() -> None:
+    scene, grid = empty_scene(DrawnWalls()), cell_room()
+    scene.add(grid)
+    info = SimpleNamespace(world_up=ROOM_UP, vocabulary=walking_actions())
+    frame = SimpleNamespace(cameras=camera_at(grid, (2, 2, 5), (9, 2, 5)))
+    region = SimpleNamespace(box=lambda truth: Box((-0.2, 0.5, -0.2), (0.2, 1.0, 0.2)))
+    view = SimpleNamespace(info=info, frame=frame, region=region, truth=grid, house=grid)
+    scenes = SimpleNamespace(seeded=lambda seed: SimpleNamespace(after=lambda view: scene))
+    bench = SimpleNamespace(scenes=scenes, body=lambda view: Body(), plan=SimpleNamespace(steps=30))
+    [window] = walk(bench, view, 0)
+    assert 0 < window["refused"] < window["tried"]
+    assert window["metres"] == pytest.approx(0.25 * (window["tried"] - window["refused"]))
