@@ -167,7 +167,7 @@ class GroundMapper:
         """Know the solid cells of a scene as they are now, in place of all points before.
 
         The floor lies in the middle of its cells, and what is higher is in the way: where a wall stands, nearly all of
-        its cell.
+        its cell. An imagined thing on observed floor is in the way too, as one that was put down there.
 
         Args:
             points: of ``Scene.points``.
@@ -185,7 +185,11 @@ class GroundMapper:
         for chosen, vote in zip(kinds, votes, strict=True):
             free = vote in (Vote.REMEMBERED_FREE, Vote.SCENE_IMAGINED_FREE)
             side = points.spread if free else CELL_SHARE * points.spread
-            self._count(vote, self._squares(positions[near & chosen, :2], side))
+            squares = self._squares(positions[near & chosen, :2], side)
+            if vote == Vote.REMEMBERED_FREE:
+                standing = positions[near & blocking & ~observed, :2]
+                squares = without(squares, self._squares(standing, CELL_SHARE * points.spread))
+            self._count(vote, squares)
 
     def forget(self, places: Float[Tensor, "place 2"], side: float) -> None:
         """Forget what frames showed around places on the ground axes, in squares of a side in metres: it changed."""

@@ -133,6 +133,11 @@ def test_imagined_frames_do_not_change_the_scene():
     assert torch.equal(world.agents[0].scene.cells.classes, scene.cells.classes)
 
 
+def test_a_thing_that_was_put_down_is_in_the_way():
+    _, result = walk(room_scene(), "pick_up drop forward")
+    assert result.free.tolist() == [True, True, False]
+
+
 def test_a_wide_agent_puts_things_down_farther_away():
     away = []
     for radius in (0.2, 0.7):
