@@ -12,14 +12,21 @@ import torch
 
 from persist_cli.api.cameras import Cameras
 from persist_cli.api.cell_things import STRUCTURE
-from persist_cli.api.cells import COMMON, FREE, OUTSIDE, SOLID, CellForm
+from persist_cli.api.cells import COMMON, FREE, OUTSIDE, SOLID, CellForm, CellGrid
 from persist_cli.api.geometry import unproject
 from persist_cli.api.reach import CHANGED
 from persist_cli.api.scene_model import Given, SceneForm, SceneSamples
 from persist_cli.api.scene_turns import Turn
 from persist_cli.data.file_hashes import FileHashes
-from persist_cli.data.scene_samples import FIXED, JITTER, SampleShares, SceneSampleDataset
-from persist_cli.data.store import write_trajectory
+from persist_cli.data.scene_samples import (
+    FIXED,
+    JITTER,
+    MOST_FRAMES,
+    SampleShares,
+    SceneSampleDataset,
+    _frames_up_to,
+)
+from persist_cli.data.store import TrajectoryFile, write_trajectory
 from persist_cli.errors import DataError
 from persist_cli.simulators.collect import CollectPlan, collect_frames
 from persist_cli.simulators.house_cells import FORM
@@ -204,6 +211,36 @@ def test_a_thing_that_is_picked_up_is_gone(houses: Path) -> None:
     assert sample.carried == 0
 
 
+def fill_level_after(action: str, dataset: SceneSampleDataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a whole level be solid in the frames after an interaction."""
+    known, around = dataset.truths, dataset.truths.around
+    later = {event.frame + 1 for file in dataset.files for event in known.interactions(file) if event.action == action}
+
+    def filled(file: TrajectoryFile, frame: int, window: CellGrid) -> CellGrid:
+        part = around(file, frame, window)
+        if frame in later:
+            part.classes[..., 5][part.classes[..., 5] == FREE] = SOLID
+        return part
+
+    monkeypatch.setattr(known, "around", filled)
+
+
+def test_what_appears_when_a_thing_is_picked_up_is_in_no_cell(houses: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    dataset = samples_of(houses, "interaction", idle=0.0)
+    plain, _ = truths(first_with(dataset, "pick_up"))
+    fill_level_after("pick_up", dataset, monkeypatch)
+    assert torch.equal(truths(first_with(dataset, "pick_up"))[0], plain)
+
+
+def test_what_an_interaction_changes_out_of_reach_is_not_told(houses: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    dataset = samples_of(houses, "interaction", idle=0.0, named_acting=1.0)
+    fill_level_after("drop", dataset, monkeypatch)
+    sample = first_with(dataset, "drop")
+    classes, content = truths(sample)[0][..., 5], sample.given[..., 5] == Given.CONTENT
+    assert bool((classes == SOLID).any())
+    assert torch.equal(classes[content], sample.classes[..., 5][content])
+
+
 def test_a_thing_that_is_dropped_is_there_again(houses: Path) -> None:
     sample = first_with(samples_of(houses, "interaction", idle=0.0), "drop")
     classes, _ = truths(sample)
@@ -329,3 +366,16 @@ def test_interactions_find_nothing_to_act_on_as_often_as_the_share_says(
     for number in range(200):
         dataset._interaction(np.random.default_rng(number))
     assert np.mean(drawn) == pytest.approx(events, abs=0.08)
+
+
+def test_trajectories_of_one_length_offer_other_frames(houses: Path) -> None:
+    dataset = samples_of(houses, "walk")
+    first, second = ([dataset._frames(file, state) for state in range(2 * FIXED)] for file in dataset.files)
+    assert len(dataset.files[0]) == len(dataset.files[1])
+    assert first != second
+
+
+def test_walks_of_few_frames_are_as_frequent_as_those_of_many() -> None:
+    lengths = np.array([len(_frames_up_to(1000, True, np.random.default_rng(number))) for number in range(400)])
+    assert (lengths.min(), lengths.max()) == (2, MOST_FRAMES)
+    assert np.mean(lengths <= np.sqrt(2 * MOST_FRAMES)) == pytest.approx(0.5, abs=0.12)

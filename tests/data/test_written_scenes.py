@@ -64,3 +64,10 @@ def test_a_kept_scene_is_taken_again(tmp_path: Path) -> None:
     known = [SceneWriter(FORM, kept).scene(file, [3]).known for _ in range(2)]
     assert torch.equal(known[0].classes, known[1].classes)
     assert len(kept) == 1
+
+
+def test_a_kept_scene_is_not_taken_for_that_of_more_frames_and_the_view_is_the_newest(tmp_path: Path) -> None:
+    kept, file = Kept(), house(tmp_path / "data", 32)
+    one, more = (SceneWriter(FORM, kept).scene(file, frames) for frames in ([9], [0, 4, 9]))
+    assert int(more.known.known.sum()) > int(one.known.known.sum())
+    assert torch.equal(more.view.rgb, file.read([9]).observations.rgb)

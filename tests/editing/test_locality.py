@@ -2,11 +2,12 @@
 
 import torch
 
+from persist_cli.api.cells import SOLID
 from persist_cli.api.scene_edits import Paint, Remove
-from persist_cli.editing.locality import edit_locality, edited_pixels
+from persist_cli.editing.locality import changed_cells, edit_locality, edited_pixels
 from persist_cli.editing.views import drawn_cells
 from persist_memory.scene.editing import apply_edits
-from tests.support.cell_rooms import BOX_CELLS, camera_at, cell_room
+from tests.support.cell_rooms import BOX_CELLS, COLORS, FLOOR, camera_at, cell_room
 
 TABLE_BOX = {"low": (0.375, 0.125, 0.375), "high": (0.875, 0.875, 1.125)}
 
@@ -50,3 +51,17 @@ def test_pictures_are_of_the_colours_of_the_cells_and_show_nothing_as_light_grey
     assert green == blue < 25
     assert bool((drawn_cells(room.box((90, 90, 0), (2, 2, 2)), camera) == 235).all())
     assert torch.equal(drawn_cells(room, camera), drawn_cells(room, camera))
+
+
+def test_a_floor_is_drawn_unshaded_although_it_lies_in_the_middle_of_its_cells():
+    room = cell_room()
+    drawn = drawn_cells(room, camera_at(room, (8, 8, 5), (9, 9, 0), size=33))
+    assert drawn[0, 12:21, 12:21].reshape(-1, 3).unique(dim=0).tolist() == [list(COLORS[FLOOR])]
+
+
+def test_a_floor_of_no_known_class_changes_its_shape_where_something_is_put_on_it():
+    before = cell_room()
+    before.classes[before.solid] = SOLID
+    after = before.copy()
+    after.classes[10, 10, 1] = SOLID
+    assert changed_cells(before, after).nonzero().tolist() == [[10, 10, 0], [10, 10, 1]]

@@ -11,6 +11,7 @@ from persist_cli.api.observations import Trajectory
 from persist_cli.errors import PersistError
 from persist_cli.play.play import Play
 from persist_cli.play.settings import PlaySettings
+from persist_cli.rollout.surroundings import Surroundings
 from persist_cli.rollout.world_model import Agent
 from tests.support.micro_model import FRAMEWISE, micro
 from tests.support.room_worlds import BODY, RoomWorld, room_info, room_views
@@ -68,3 +69,10 @@ def test_a_jump_goes_to_free_ground_only():
         play.jump(here.x, here.y + 1.95)
     with pytest.raises(PersistError, match="nothing is known of the ground there"):
         play.jump(here.x + 50, here.y)
+
+
+def test_a_turn_is_never_in_the_way_of_anything(monkeypatch):
+    play = play_in_room(look((1.7, 1.25, 0.0), 0.0, 0.0))
+    monkeypatch.setattr(Surroundings, "blocks", lambda *_: True)  # by what the clip itself shows
+    assert [play.advance(LEFT).free for _ in range(3)] == [True] * 3
+    assert [play.advance(FORWARD).free for _ in range(2)] == [True, False]

@@ -124,6 +124,15 @@ def test_home_is_the_start_pose_as_it_is_imagined(backbone, walks):
     assert not torch.equal(shown.images["voxel"], start.images["voxel"])
 
 
+def test_a_look_from_elsewhere_is_the_last_frame_of_a_clip_that_stands_still(backbone, walks):
+    play, world = play_on(backbone, walks), rollout_world(backbone, walks)
+    shown = play.home()
+    backbone.use_adapter("voxel")
+    still = world.agents[0].cameras_after(["stay"] * 8)
+    truth = world.predict([0], [still], [(None,) * 8])[0]
+    assert torch.equal(shown.images["voxel"], truth.rgb[-1])
+
+
 def test_what_a_model_without_depth_lacks_is_told_in_a_line(backbone, walks):
     assert play_on(backbone, walks).notices == ()
     play = micro_walks(walks, backbone=remembering_model(depth=False))()

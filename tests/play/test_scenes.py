@@ -37,6 +37,10 @@ def cells_of(play: Play) -> dict[str, torch.Tensor]:
     return play._walkers.lead.memory.tensors()
 
 
+def ground_of(play: Play) -> torch.Tensor:
+    return play._walkers.lead.surroundings.map().states
+
+
 def box_is_there(play: Play) -> bool:
     grid = cell_room()
     return bool(play._walkers.lead.scene.cells.box(grid.corner, grid.shape).solid[BOX_CELLS].any())
@@ -102,3 +106,14 @@ def test_an_interaction_with_nothing_in_reach_is_refused():
     assert play.advance(frozenset({"toggle"})) is None
     play.advance(frozenset())
     assert not play.advance(frozenset({"toggle"})).free
+
+
+def test_where_a_thing_was_picked_up_the_way_stays_free_when_its_drop_is_undone():
+    play = play_in_scene()
+    play.advance(PICK_UP)
+    before = ground_of(play)
+    assert play.advance(frozenset({"drop"})).free
+    assert not torch.equal(ground_of(play), before)
+    play.undo()
+    assert torch.equal(ground_of(play), before)
+    assert [play.advance(FORWARD).free for _ in range(4)] == [True] * 4

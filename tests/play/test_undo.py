@@ -102,3 +102,14 @@ def test_the_map_after_an_undone_step_is_the_one_before_it():
     play.advance(FORWARD)
     play.undo()
     assert torch.equal(play.map(128).picture, before.picture)
+
+
+def test_a_frame_that_is_undone_is_not_remembered_although_those_before_it_are(backbone, walks):
+    play, other = play_on(backbone, walks), play_on(backbone, walks)
+    walked(play, LEFT, 3)
+    walked(other, LEFT, 2)
+    play.undo()
+    before = memory_of(other)
+    assert same(memory_of(play), before)
+    walked(other, LEFT, 1)
+    assert not same(memory_of(other), before)

@@ -1,5 +1,6 @@
 """What a world model imagines at a camera that was placed by hand."""
 
+import math
 import subprocess
 import sys
 from dataclasses import replace
@@ -7,6 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from persist_cli.api.actions import rotation_about
 from persist_cli.api.geometry import pose_differences
 from persist_cli.data.store import Store
 from persist_cli.errors import PersistError
@@ -30,6 +32,15 @@ def test_the_way_ends_at_the_camera_in_steps_as_small_as_those_of_training(walks
     assert len(way) == 9
     assert float(metres.max()) <= STEP
     assert float(degrees.max()) <= TURN
+
+
+def test_a_camera_that_looks_elsewhere_is_reached_in_turns_as_small_as_those_of_training(walks):
+    first = Store(walks)[0].poses()[0]
+    last = first.clone()
+    last[:3, :3] = rotation_about(torch.tensor([0.0, 1.0, 0.0]), math.radians(150)) @ last[:3, :3]
+    way = torch.cat([first[None], way_to(first, last, 8)])
+    assert float(pose_differences(way[:-1], way[1:])[1].max()) <= TURN
+    assert torch.allclose(way[-1], last)
 
 
 def test_a_camera_far_off_is_reached_with_a_bounded_number_of_clips(walks):
