@@ -1,4 +1,4 @@
-"""The code of plugins of other packages: what one measured or computed is not of its code after a change."""
+"""The code of plugins of other packages: after a change, what one measured or computed before is not its own."""
 
 from __future__ import annotations
 
@@ -55,5 +55,5 @@ def _sources(module: str) -> tuple[Path, list[Path]]:
         if spec.submodule_search_locations is None:
             return file.parent, [file]
         modules = (path for path in file.parent.rglob("*.*") if path.name.endswith(MODULES))
-        return file.parent, [*modules]
+        return file.parent, [path for path in modules if path.is_file()]  # editors lock files by links to nothing
     return Path(), []

@@ -30,6 +30,7 @@ def test_a_package_is_told_by_any_of_its_modules_and_by_nothing_else(memory):
     (memory / "README.md").write_text("nothing that is run")
     (memory / "frames/__pycache__").mkdir()
     (memory / "frames/__pycache__/last.cpython-311.pyc").touch()
+    (memory / "frames/.#last.py").symlink_to("somebody@here")  # as Emacs locks a file that is edited
     assert code_of("memory", "last") == before
     (memory / "sizes.py").write_text("SIZE = 2")
     after = code_of("memory", "last")
