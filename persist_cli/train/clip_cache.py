@@ -28,7 +28,7 @@ from persist_cli.data.writing_noise import WritingNoise
 from persist_cli.memorize.factory import MemoryFactory, with_memory
 from persist_cli.memorize.kept_features import KeptFeatures
 from persist_cli.memorize.sources import Source
-from persist_cli.plugin_code import code_of_others
+from persist_cli.plugin_code import code_of
 from persist_cli.plugins import find_plugin
 from persist_cli.recipe import MemoryConfig, Recipe
 from persist_cli.train.feature_cache import FeatureCache
@@ -39,7 +39,7 @@ TOKENS: Final = 2  # format of memory tokens; those of 1 have neither colours no
 
 # what the features of a frame depend on, among all that tokens depend on
 FEATURES: Final = frozenset(
-    ("persist", "torch", "device", "encoder", "encoder_settings", "features", "packages", "code")
+    ("persist", "torch", "device", "encoder", "encoder_settings", "features", "packages", "encoder_code")
 )
 
 
@@ -88,12 +88,13 @@ class CacheKeys:
             precision: in which it encodes: accelerate's, which is ``no`` for DeepSpeed whatever the recipe's.
         """
         encoded_by = {"persist": __version__, "torch": torch.__version__, "device": device}
-        latents = encoded_by | {"encoding": backbone.encoding(), "precision": precision}
+        encoding = {"precision": precision} | _code_of("backbone", backbone.name)
+        latents = encoded_by | {"encoding": backbone.encoding()} | encoding
         tokens = None
         if factory is not None and recipe.memory is not None:
             tokens = encoded_by | _token_dependencies(recipe.memory, factory, backbone)
             if kept := backbone.token_encoding():
-                tokens |= {"kept": kept, "precision": precision}
+                tokens |= {"kept": kept} | encoding
             if noise := WritingNoise.of(recipe.data):
                 tokens |= {"noise": dataclasses.asdict(noise)}
         return CacheKeys(
@@ -308,7 +309,6 @@ def framewise_latents(video: Tensor) -> ClipLatents:
 def _token_dependencies(memory: MemoryConfig, factory: MemoryFactory, backbone: Backbone) -> dict[str, Any]:
     """The JSON values that memory tokens depend on; the features of a fixed picture stand for the encoder's weights."""
     plugins = [find_plugin("memory", memory.name), find_plugin("encoder", memory.encoder)]
-    code = code_of_others(*((plugin.kind, plugin.name) for plugin in plugins))
     return {
         "tokens": TOKENS,
         "memory": memory.name,
@@ -319,15 +319,25 @@ def _token_dependencies(memory: MemoryConfig, factory: MemoryFactory, backbone: 
         "budget": backbone.token_budget,
         **_imagined_by(factory),
         "packages": [[plugin.package, plugin.version] for plugin in plugins],
-        **({"code": code} if code else {}),
+        **_code_of("memory", memory.name),
+        **_code_of("encoder", memory.encoder),
     }
 
 
-def _imagined_by(factory: MemoryFactory) -> dict[str, str]:
-    """The hash of the model that imagines in the memories, where there is one."""
+def _code_of(kind: str, name: str) -> dict[str, str]:
+    """The code of a plugin under a key of its kind; nothing for one of persist's own."""
+    code = code_of(kind, name)
+    return {} if code is None else {f"{kind}_code": code}
+
+
+def _imagined_by(factory: MemoryFactory) -> dict[str, Any]:
+    """The hash of the model that imagines in the memories, and its code where that is of another package."""
     memory = factory.kind(factory.settings, factory.encoder, FrameOfReference(""))
     name = memory.wanted_model if isinstance(memory, Scene) else None
-    return {"imagined_by": find_scene_model(name).fingerprint} if name else {}
+    if not name:
+        return {}
+    model = find_scene_model(name)
+    return {"imagined_by": model.fingerprint} | _code_of("scene model", model.plugin)
 
 
 def _features_hash(encoder: Encoder, backbone: Backbone) -> str:

@@ -1,9 +1,10 @@
 """A folder of tensors by key, which processes and runs share.
 
-An entry is a safetensors file. Its name is its key: a hash of data, weights, settings and versions of packages, on
-which its content depends. When code changes and its version does not, the folder must be removed by hand. Two processes
-may write an entry at once, because both write the same, aside, and then rename it. Once the folder is full nothing more
-is stored; entries are never replaced. The hashes of data files, of a line each, lie beside them and do not count.
+An entry is a safetensors file. Its name is its key: a hash of all that its content depends on, which is data, weights,
+settings, versions of packages, and the code of plugins of other packages. When the code of persist changes and its
+version does not, the folder must be removed by hand. Two processes may write an entry at once, because both write the
+same, aside, and then rename it. Once the folder is full nothing more is stored; entries are never replaced. The hashes
+of data files, of a line each, lie beside them and do not count.
 """
 
 from __future__ import annotations

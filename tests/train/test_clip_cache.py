@@ -227,11 +227,9 @@ def test_tokens_that_are_kept_as_rendered_views_depend_on_the_rendering_the_code
     assert len({clip.tokens for clip in clip_keys}) == len(clip_keys)
 
 
-@pytest.mark.parametrize("newer", ["memory", "encoder", "code"])
-def test_another_version_or_code_of_a_plugin_changes_the_key_of_tokens(keys_of, monkeypatch, newer):
+@pytest.mark.parametrize("newer", ["memory", "encoder"])
+def test_another_version_of_a_plugin_changes_the_key_of_tokens(keys_of, monkeypatch, newer):
     before = keys_of()
-    if newer == "code":
-        monkeypatch.setattr(clip_cache, "code_of_others", lambda *named: dict(named))
 
     def find(kind, name):
         plugin = find_plugin(kind, name)
@@ -240,6 +238,24 @@ def test_another_version_or_code_of_a_plugin_changes_the_key_of_tokens(keys_of, 
     monkeypatch.setattr(clip_cache, "find_plugin", find)
     assert keys_of().latents == before.latents
     assert keys_of().tokens != before.tokens
+
+
+@pytest.mark.parametrize(
+    ("edited", "adapter", "changed"),
+    [
+        ("memory", {}, {"tokens", "memory"}),
+        ("encoder", {}, {"tokens", "memory"}),
+        ("backbone", {}, {"latents"}),
+        ("backbone", {"form": "rendered"}, {"latents", "tokens", "memory"}),  # whose codec encodes what is rendered
+    ],
+)
+def test_edited_code_of_a_plugin_of_another_package_changes_the_keys_of_what_it_computes(
+    keys_of, monkeypatch, edited, adapter, changed
+):
+    before = keys_of(adapter=adapter)
+    monkeypatch.setattr(clip_cache, "code_of", lambda kind, name: f"{name} edited" if kind == edited else None)
+    after = keys_of(adapter=adapter)
+    assert {part for part in vars(after) if getattr(after, part) != getattr(before, part)} == changed
 
 
 def test_another_device_or_version_and_another_format_of_entries_change_all_keys(keys_of, monkeypatch):

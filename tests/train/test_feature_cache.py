@@ -83,8 +83,11 @@ def test_other_trajectories_and_what_else_features_depend_on_have_entries_of_the
 
 
 def test_features_depend_on_the_encoder_and_not_on_the_memory_that_reads_them(tmp_path):
-    of_the_encoder = {"persist", "torch", "device", "encoder", "encoder_settings", "features", "packages"}
-    tokens = dict.fromkeys((*of_the_encoder, "memory", "settings", "budget", "noise", "kept", "precision"), "")
+    of_the_encoder = {
+        "persist", "torch", "device", "encoder", "encoder_settings", "encoder_code", "features", "packages",
+    }  # fmt: skip
+    of_others = ("memory", "memory_code", "settings", "budget", "noise", "kept", "backbone_code", "precision")
+    tokens = dict.fromkeys((*of_the_encoder, *of_others), "")
     keys = CacheKeys(latents={}, tokens=tokens, whole_trajectories=False)
     factory: Any = SimpleNamespace(encoder=KeptFeatures(Counting(None)))
     features = ClipCache.of(TensorCache(CacheSettings(tmp_path, 1)), keys, factory).features
