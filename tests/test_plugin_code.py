@@ -7,6 +7,9 @@ import shutil
 
 import pytest
 
+from persist_cli.checkpoints.scene_models import write_scene_card
+from persist_cli.evaluate.provenance import adapter_code
+from persist_cli.io.files import write_json
 from persist_cli.plugin_code import code_of, code_of_others
 from tests.support.micro_runs import stage
 from tests.support.packages import LAST_FRAME, install
@@ -64,6 +67,14 @@ def test_a_plugin_whose_module_is_gone_is_told_by_its_package_alone(memory, site
     shutil.rmtree(memory)
     importlib.invalidate_caches()
     assert (code_of("memory", "last") or "").startswith("persist-last 1.2, code ")
+
+
+def test_an_adapter_depends_on_the_model_that_imagines_in_its_scenes(site, tmp_path):
+    install(site, "persist-dreams", "persist.scene_models", "dreams = dreaming:Dreams", "SIZE = 1")
+    write_json(tmp_path / "memory.json", {"name": "scene", "settings": {"model": str(tmp_path)}})
+    assert adapter_code(tmp_path) == {}  # there is no such model
+    write_scene_card(tmp_path, "dreams", {}, "scene", None)
+    assert adapter_code(tmp_path) == {"scene model dreams": code_of("scene model", "dreams")}
 
 
 def test_an_evaluation_does_not_go_on_with_an_edited_memory(persist, site, walks, held_out, stage1, tmp_path):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import platform
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -14,13 +16,16 @@ from persist_cli import __version__
 from persist_cli.api.checkpoint import WEIGHTS, Checkpoint
 from persist_cli.checkpoints import lineage
 from persist_cli.checkpoints.load import adapter_memory
+from persist_cli.checkpoints.scene_models import find_scene_model, with_model_beside
 from persist_cli.data.held_out import was_trained_on
+from persist_cli.errors import PersistError
 from persist_cli.evaluate.cases import Case
 from persist_cli.io.files import file_sha256, files_sha256, read_json
 from persist_cli.io.hub import cached_weight
 from persist_cli.memorize.imagining import scene_model_fingerprint
 from persist_cli.metrics.metric import Metric
 from persist_cli.plugin_code import code_of_others
+from persist_cli.recipe import MemoryConfig
 
 PACKAGES = ("accelerate", "diffusers", "numpy", "safetensors", "scipy", "torch", "torchmetrics", "transformers")
 
@@ -59,14 +64,24 @@ def checkpoint_json(checkpoint: Checkpoint) -> dict[str, Any]:
 def adapter_json(folder: Path) -> dict[str, Any]:
     """The hashes of an adapter's weights and of its settings, among them the memory that it reads, as JSON values.
 
-    Where memory or encoder are of another package, that of their code is there as well.
+    Where memory, encoder or the model that imagines are of another package, that of their code is there as well.
     """
     files = list(folder.glob(f"*{WEIGHTS}"))
     weights = file_sha256(files[0]) if len(files) == 1 else files_sha256(folder, files)
-    memory = read_json(folder / lineage.MEMORY_FILE)
-    code = code_of_others(("memory", memory["name"]), ("encoder", memory["encoder"]))
+    code = adapter_code(folder)
     hashes = {"weights": weights, "settings": files_sha256(folder, folder.glob("*.json"))}
     return hashes | ({"code": code} if code else {})
+
+
+def adapter_code(folder: Path) -> dict[str, str]:
+    """The code of the plugins of other packages that the memory of an adapter needs; none is loaded."""
+    memory = asdict(MemoryConfig()) | read_json(folder / lineage.MEMORY_FILE)
+    plugins = [("memory", memory["name"]), ("encoder", memory["encoder"])]
+    model = with_model_beside(memory["settings"], folder).get("model")
+    if model is not None:
+        with contextlib.suppress(PersistError):  # whoever imagines with it says so
+            plugins.append(("scene model", find_scene_model(str(model)).plugin))
+    return code_of_others(*plugins)
 
 
 def scene_models(checkpoints: Sequence[Checkpoint], memories: Sequence[str]) -> list[dict[str, str]]:

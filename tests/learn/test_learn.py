@@ -344,6 +344,14 @@ def test_a_folder_of_another_adapter_is_refused(learn, voxel):
     assert (result.code, "holds another learning (adapter sha256: " in result.err) == (1, True), result.err
 
 
+def test_a_learning_does_not_go_on_with_edited_code_of_another_package(learn, monkeypatch):
+    for code in ("as it was", "edited"):
+        plugins = {"policy nomad": code}
+        monkeypatch.setattr("persist_cli.learn.learn.code_of_others", lambda *_, plugins=plugins: plugins)
+        result = learn("out")
+    assert result.err.count("holds another learning (code policy nomad: as it was, now edited)") == result.code == 1
+
+
 def test_a_learning_goes_on_with_views_that_were_moved_and_with_no_others(learn, walks, tmp_path):
     assert learn("out").code == 0
     assert learn("out", data=shutil.copytree(walks, tmp_path / "moved")).code == 0
