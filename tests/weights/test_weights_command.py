@@ -29,9 +29,9 @@ def test_the_list_shows_licence_size_sources_and_folder_of_every_weight(persist,
     assert {name: (row["bytes"], row["sha256"]) for name, row in rows.items()} == known
     table = persist("weights", "list").out
     assert f" {WEIGHTS['lpips-alex'].size / 1e6:.1f} " in table
-    for known in WEIGHTS.values():
-        assert known.name in table
-        assert known.licence in table
+    for one in WEIGHTS.values():
+        assert one.name in table
+        assert one.licence in table
 
 
 def test_path_prints_the_folder_and_nothing_else(persist, tmp_path):
