@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
 from typing import Any, Final
 
 import torch
 
-from persist_cli.api.observations import Observations
+from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.api.policy import Goal, Policy
 from persist_cli.api.simulator import Simulator
-from persist_cli.episodes.episodes import Episode
+from persist_cli.episodes.episodes import Episode, EpisodeSet, read_episodes
 from persist_cli.episodes.navigator import Navigator, PlanSettings, RowParts
 from persist_cli.episodes.rows import PlanningRow
 from persist_cli.episodes.run_episode import LoopSettings, run_closed_loop
 from persist_cli.episodes.stop_rules import StopByCost, StopRule
 from persist_cli.episodes.true_scene import TrueScene
-from persist_cli.errors import PersistError
+from persist_cli.errors import DataError, PersistError
+from persist_cli.io.settings import parse_settings
 from persist_cli.output.console import watched
-from persist_cli.plugins import make_cost
+from persist_cli.plugins import load_plugin, make_cost
 
 # shown the goal image, given nothing else
 ROW = PlanningRow(name="policy", planner="policy", policy=None, memory=None, goal="image", walk=False)
@@ -34,6 +37,41 @@ class NeverStops:
     def stops(self, view: Observations, goal: Goal, world_up: Sequence[float]) -> bool:
         """Return false."""
         return False
+
+
+def episodes_of(file: Path, info: TrajectoryInfo, simulator: Simulator) -> list[Episode]:
+    """Return the episodes of a file that are in the scene of the views.
+
+    Args:
+        file: of episodes.
+        info: of the views.
+        simulator: of the views, in which the episodes are run.
+
+    Raises:
+        DataError: when there is none, or their simulator is another one or has another agent.
+    """
+    read = read_episodes(file)
+    check_agent(file, read, simulator)
+    found = [episode for episode in read.episodes if episode.scene_name == info.scene]
+    if not found:
+        raise DataError(
+            f"{file}: no episode in scene {info.scene!r}, which the views show; draw some with its --scenes"
+        )
+    return found
+
+
+def check_agent(file: Path, episodes: EpisodeSet, simulator: Simulator) -> None:
+    """Raise ``DataError`` when the agent of some episodes is another than that of the views' simulator."""
+    if episodes.simulator != simulator.name:
+        raise DataError(f"{file}: episodes of simulator {episodes.simulator!r}, the views are of {simulator.name!r}")
+    drawn = asdict(parse_settings(load_plugin("simulator", simulator.name).settings_type, episodes.settings, str(file)))
+    ours = asdict(simulator.settings)
+    other = [name for name in drawn if drawn[name] != ours[name]]
+    if other:
+        theirs, own = (" and ".join(f"{name} {values[name]}" for name in other) for values in (drawn, ours))
+        raise DataError(
+            f"{file}: episodes with {theirs}, the views were collected with {own}; give them to `bench episodes`"
+        )
 
 
 def stop_rule(cost: float) -> StopRule:

@@ -27,15 +27,14 @@ from persist_cli.checkpoints.contamination import refuse_training_episodes
 from persist_cli.checkpoints.placement import check_placement
 from persist_cli.checkpoints.retention import ended_recipe
 from persist_cli.data.store import write_trajectory
-from persist_cli.episodes.episodes import Episode, EpisodeSet, read_episodes
+from persist_cli.episodes.episodes import Episode
 from persist_cli.episodes.run_episode import LoopSettings
 from persist_cli.errors import DataError, PersistError
 from persist_cli.evaluate.provenance import adapter_code
 from persist_cli.io.begun_with import check_same
 from persist_cli.io.exclusive import exclusive
 from persist_cli.io.files import check_folder, file_sha256, read_json, write_json, write_text
-from persist_cli.io.settings import parse_settings
-from persist_cli.learn.evaluation import STOP_COST, evaluate_policy, mean_figures, stop_rule
+from persist_cli.learn.evaluation import STOP_COST, episodes_of, evaluate_policy, mean_figures, stop_rule
 from persist_cli.learn.places import ImaginedPlace, PracticePlace, TruePlace
 from persist_cli.learn.practice import PracticeSettings, info_of_walks, practise
 from persist_cli.memorize.sources import common_reference, find_sources
@@ -43,7 +42,7 @@ from persist_cli.output.console import add_task, print_json, print_table, progre
 from persist_cli.output.curve import Curve, draw_curves
 from persist_cli.planning.true_futures import open_again
 from persist_cli.plugin_code import code_of_others
-from persist_cli.plugins import load_plugin, make_policy, make_settings
+from persist_cli.plugins import make_policy, make_settings
 from persist_cli.policies.open_policy import acting_settings, open_trained
 from persist_cli.policies.trained import TrainedPolicy, find_policy, packaged_policy
 from persist_cli.recipe import apply_overrides, make_recipe
@@ -280,41 +279,6 @@ def check_held_out(plan: LearnPlan, begin: TrainedPolicy, scene: str) -> None:
     """Raise ``DataError`` when model or policy were trained on the evaluated scene, unless that is allowed."""
     checkpoint = find_checkpoint(plan.checkpoint) if plan.inside == MODEL else None
     refuse_training_episodes([scene], checkpoint, begin, plan.allow_training_scenes)
-
-
-def episodes_of(file: Path, info: TrajectoryInfo, simulator: Simulator) -> list[Episode]:
-    """Return the episodes of a file that are in the scene of the views.
-
-    Args:
-        file: of episodes.
-        info: of the views.
-        simulator: of the views, in which the episodes are run.
-
-    Raises:
-        DataError: when there is none, or their simulator is another one or has another agent.
-    """
-    read = read_episodes(file)
-    check_agent(file, read, simulator)
-    found = [episode for episode in read.episodes if episode.scene_name == info.scene]
-    if not found:
-        raise DataError(
-            f"{file}: no episode in scene {info.scene!r}, which the views show; draw some with its --scenes"
-        )
-    return found
-
-
-def check_agent(file: Path, episodes: EpisodeSet, simulator: Simulator) -> None:
-    """Raise ``DataError`` when the agent of some episodes is another than that of the views' simulator."""
-    if episodes.simulator != simulator.name:
-        raise DataError(f"{file}: episodes of simulator {episodes.simulator!r}, the views are of {simulator.name!r}")
-    drawn = asdict(parse_settings(load_plugin("simulator", simulator.name).settings_type, episodes.settings, str(file)))
-    ours = asdict(simulator.settings)
-    other = [name for name in drawn if drawn[name] != ours[name]]
-    if other:
-        theirs, own = (" and ".join(f"{name} {values[name]}" for name in other) for values in (drawn, ours))
-        raise DataError(
-            f"{file}: episodes with {theirs}, the views were collected with {own}; give them to `bench episodes`"
-        )
 
 
 def open_simulator(plan: LearnPlan, info: TrajectoryInfo) -> Simulator:
