@@ -36,10 +36,15 @@ def code_of(kind: str, name: str) -> str | None:
     return f"{plugin.package} {plugin.version}, code {code[:SHOWN]}"
 
 
-def code_of_others(*plugins: tuple[str, str]) -> dict[str, str]:
-    """What ``code_of`` says of those of these plugins, by kind and name, that are not persist's own."""
+def code_json(*plugins: tuple[str, str]) -> dict[str, dict[str, str]]:
+    """What ``code_of`` says of plugins, under the key ``code``, for JSON values of what was made with them.
+
+    Args:
+        plugins: kind and name of each. Those of persist's own are left out, and without another there is no key.
+    """
     found = {f"{kind} {name}": code_of(kind, name) for kind, name in plugins}
-    return {plugin: code for plugin, code in found.items() if code is not None}
+    others = {plugin: code for plugin, code in found.items() if code is not None}
+    return {"code": others} if others else {}
 
 
 def _sources(module: str) -> tuple[Path, list[Path]]:

@@ -8,9 +8,9 @@ import shutil
 import pytest
 
 from persist_cli.checkpoints.scene_models import write_scene_card
-from persist_cli.evaluate.provenance import adapter_code
+from persist_cli.evaluate.provenance import adapter_plugins
 from persist_cli.io.files import write_json
-from persist_cli.plugin_code import code_of, code_of_others
+from persist_cli.plugin_code import code_json, code_of
 from tests.support.micro_runs import stage
 from tests.support.packages import LAST_FRAME, install
 
@@ -59,8 +59,9 @@ def test_other_packages_of_a_namespace_and_other_modules_beside_one_do_not_count
 
 def test_persists_own_plugins_are_told_by_their_version_alone(memory):
     assert code_of("memory", "voxel") is None
-    others = code_of_others(("memory", "voxel"), ("memory", "last"), ("encoder", "gone"))
-    assert others == {"memory last": code_of("memory", "last"), "encoder gone": "not installed"}
+    assert code_json(("memory", "voxel"), ("encoder", "patches")) == {}
+    others = code_json(("memory", "voxel"), ("memory", "last"), ("encoder", "gone"))
+    assert others == {"code": {"memory last": code_of("memory", "last"), "encoder gone": "not installed"}}
 
 
 def test_a_plugin_whose_module_is_gone_is_told_by_its_package_alone(memory, site):
@@ -72,9 +73,9 @@ def test_a_plugin_whose_module_is_gone_is_told_by_its_package_alone(memory, site
 def test_an_adapter_depends_on_the_model_that_imagines_in_its_scenes(site, tmp_path):
     install(site, "persist-dreams", "persist.scene_models", "dreams = dreaming:Dreams", "SIZE = 1")
     write_json(tmp_path / "memory.json", {"name": "scene", "settings": {"model": str(tmp_path)}})
-    assert adapter_code(tmp_path) == {}  # there is no such model
+    plugins = adapter_plugins(tmp_path)  # there is no such model
     write_scene_card(tmp_path, "dreams", {}, "scene", None)
-    assert adapter_code(tmp_path) == {"scene model dreams": code_of("scene model", "dreams")}
+    assert adapter_plugins(tmp_path) == [*plugins, ("scene model", "dreams")]
 
 
 def test_an_evaluation_does_not_go_on_with_an_edited_memory(persist, site, walks, held_out, stage1, tmp_path):

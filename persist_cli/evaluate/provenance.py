@@ -24,7 +24,7 @@ from persist_cli.io.files import file_sha256, files_sha256, read_json
 from persist_cli.io.hub import cached_weight
 from persist_cli.memorize.imagining import scene_model_fingerprint
 from persist_cli.metrics.metric import Metric
-from persist_cli.plugin_code import code_of_others
+from persist_cli.plugin_code import code_json
 from persist_cli.recipe import MemoryConfig
 
 PACKAGES = ("accelerate", "diffusers", "numpy", "safetensors", "scipy", "torch", "torchmetrics", "transformers")
@@ -48,7 +48,6 @@ def checkpoint_json(checkpoint: Checkpoint) -> dict[str, Any]:
     """A checkpoint with the hashes of its base, recipes, adapters and their settings as JSON values."""
     adapters = {name: adapter_json(folder) for name, folder in checkpoint.adapters.items()}
     code = {name: hashes["code"] for name, hashes in adapters.items() if "code" in hashes}
-    backbone = code_of_others(("backbone", checkpoint.backbone))
     return {
         "name": checkpoint.name,
         "path": str(checkpoint.folder),
@@ -56,7 +55,7 @@ def checkpoint_json(checkpoint: Checkpoint) -> dict[str, Any]:
         "recipe_sha256": recipe_sha256(checkpoint.folder),
         "adapters": {name: hashes["weights"] for name, hashes in adapters.items()},
         "adapter_settings": {name: hashes["settings"] for name, hashes in adapters.items()},
-        **({"code": backbone} if backbone else {}),
+        **code_json(("backbone", checkpoint.backbone)),
         **({"adapter_code": code} if code else {}),
     }
 
@@ -68,20 +67,19 @@ def adapter_json(folder: Path) -> dict[str, Any]:
     """
     files = list(folder.glob(f"*{WEIGHTS}"))
     weights = file_sha256(files[0]) if len(files) == 1 else files_sha256(folder, files)
-    code = adapter_code(folder)
-    hashes = {"weights": weights, "settings": files_sha256(folder, folder.glob("*.json"))}
-    return hashes | ({"code": code} if code else {})
+    settings = files_sha256(folder, folder.glob("*.json"))
+    return {"weights": weights, "settings": settings, **code_json(*adapter_plugins(folder))}
 
 
-def adapter_code(folder: Path) -> dict[str, str]:
-    """The code of the plugins of other packages that the memory of an adapter needs; none is loaded."""
+def adapter_plugins(folder: Path) -> list[tuple[str, str]]:
+    """The plugins that the memory of an adapter needs, by kind and name; none is loaded."""
     memory = asdict(MemoryConfig()) | read_json(folder / lineage.MEMORY_FILE)
     plugins = [("memory", memory["name"]), ("encoder", memory["encoder"])]
     model = with_model_beside(memory["settings"], folder).get("model")
     if model is not None:
         with contextlib.suppress(PersistError):  # whoever imagines with it says so
             plugins.append(("scene model", find_scene_model(str(model)).plugin))
-    return code_of_others(*plugins)
+    return plugins
 
 
 def scene_models(checkpoints: Sequence[Checkpoint], memories: Sequence[str]) -> list[dict[str, str]]:

@@ -30,7 +30,7 @@ from persist_cli.data.store import write_trajectory
 from persist_cli.episodes.episodes import Episode
 from persist_cli.episodes.run_episode import LoopSettings
 from persist_cli.errors import DataError, PersistError
-from persist_cli.evaluate.provenance import adapter_code
+from persist_cli.evaluate.provenance import adapter_plugins
 from persist_cli.io.begun_with import check_same
 from persist_cli.io.exclusive import exclusive
 from persist_cli.io.files import check_folder, file_sha256, read_json, write_json, write_text
@@ -41,7 +41,7 @@ from persist_cli.memorize.sources import common_reference, find_sources
 from persist_cli.output.console import add_task, print_json, print_table, progress, say
 from persist_cli.output.curve import Curve, draw_curves
 from persist_cli.planning.true_futures import open_again
-from persist_cli.plugin_code import code_of_others
+from persist_cli.plugin_code import code_json
 from persist_cli.plugins import make_policy, make_settings
 from persist_cli.policies.open_policy import acting_settings, open_trained
 from persist_cli.policies.trained import TrainedPolicy, find_policy, packaged_policy
@@ -218,8 +218,7 @@ def identity(learning: Learning) -> dict[str, Any]:
         values |= model_identity(plan)
     if plan.episodes is not None:
         values["episodes"] = file_sha256(plan.episodes)
-    if code := code_of_plugins(learning):
-        values["code"] = code
+    values |= code_json(*plugins_of(learning))
     return dict(json.loads(json.dumps(values, default=str)))
 
 
@@ -231,17 +230,18 @@ def model_identity(plan: LearnPlan) -> dict[str, Any]:
     return {"checkpoint": checkpoint.fingerprint, "adapter": {"name": adapter or PLAIN, "sha256": weights}}
 
 
-def code_of_plugins(learning: Learning) -> dict[str, str]:
-    """Return the code of the plugins of other packages that act, imagine or show the true scene."""
+def plugins_of(learning: Learning) -> list[tuple[str, str]]:
+    """Return the plugins that act, imagine or show the true scene, by kind and name."""
     plan, plugins = learning.plan, [("policy", learning.begin.plugin)]
     if learning.simulator is not None:
         plugins.append(("simulator", learning.simulator.name))
-    if plan.inside != MODEL:
-        return code_of_others(*plugins)
-    checkpoint = find_checkpoint(plan.checkpoint)
-    adapter = checkpoint.chosen_adapter(plan.adapter)
-    memory = {} if adapter is None else adapter_code(checkpoint.adapter_folder(adapter))
-    return code_of_others(*plugins, ("backbone", checkpoint.backbone)) | memory
+    if plan.inside == MODEL:
+        checkpoint = find_checkpoint(plan.checkpoint)
+        plugins.append(("backbone", checkpoint.backbone))
+        adapter = checkpoint.chosen_adapter(plan.adapter)
+        if adapter is not None:
+            plugins += adapter_plugins(checkpoint.adapter_folder(adapter))
+    return plugins
 
 
 def digest(views: Observations) -> str:

@@ -346,8 +346,7 @@ def test_a_folder_of_another_adapter_is_refused(learn, voxel):
 
 def test_a_learning_does_not_go_on_with_edited_code_of_another_package(learn, monkeypatch):
     for code in ("as it was", "edited"):
-        plugins = {"policy nomad": code}
-        monkeypatch.setattr("persist_cli.learn.learn.code_of_others", lambda *_, plugins=plugins: plugins)
+        monkeypatch.setattr("persist_cli.plugin_code.code_of", lambda _, name, code=code: {"nomad": code}.get(name))
         result = learn("out")
     assert result.err.count("holds another learning (code policy nomad: as it was, now edited)") == result.code == 1
 

@@ -36,7 +36,7 @@ from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.metrics.src import chosen_encoder
 from persist_cli.output.console import add_task, busy, progress
 from persist_cli.planning.planners import check_horizon
-from persist_cli.plugin_code import code_of_others
+from persist_cli.plugin_code import code_json
 from persist_cli.plugins import make_cost
 from persist_cli.policies.open_policy import acting_settings, open_policy
 from persist_cli.policies.trained import TrainedPolicy, find_policy, packaged_policy
@@ -353,7 +353,7 @@ def identity(
     """Return JSON values of all that changes a figure of any row: a benchmark with equal values goes on."""
     sampling = checkpoint.sampling_with(plan.sampling) if checkpoint is not None else None
     searched = any(row.searches for row in rows)
-    code = code_of_others(("cost", cost.name), *([("policy", policy.name)] if policy is not None else []))
+    plugins = [("cost", cost.name)] + ([] if policy is None else [("policy", policy.name)])
     values = {
         "episodes": plan.source.identity(),
         "cost": {"name": cost.name, "settings": asdict(cost.settings)},
@@ -365,7 +365,7 @@ def identity(
         "stop cost": plan.stop_cost,
         "checkpoint": None if checkpoint is None else checkpoint_json(checkpoint),
         "sampling": None if sampling is None else asdict(sampling) | plan.placement.changes(),
-        **({"code": code} if code else {}),
+        **code_json(*plugins),
     }
     return dict(json.loads(json.dumps(values, default=str)))
 

@@ -44,7 +44,7 @@ from persist_cli.memorize.factory import MemoryFactory
 from persist_cli.memorize.memory_config import plugin_settings, scene_config
 from persist_cli.navigation.ground_mapper import body_of
 from persist_cli.output.console import add_task, progress
-from persist_cli.plugin_code import code_of_others
+from persist_cli.plugin_code import code_json
 from persist_cli.recipe import MemoryConfig
 
 WIDEST: Final = 50.0  # metres around a camera that are measured at most
@@ -311,8 +311,8 @@ def part_identities(
     The numbers of seeds, walks, edits and interactions may change: what is there is kept.
     """
     model: dict[str, Any] = {"model": None if trained is None else trained.fingerprint}
-    if trained is not None and (code := code_of_others(("scene model", trained.plugin))):
-        model["code"] = code
+    if trained is not None:
+        model |= code_json(("scene model", trained.plugin))
     parts: dict[str, dict[str, Any]] = {"walk": model | {"steps": plan.steps}, "speed": model}
     if plan.rendering is not None:
         rendering = {part: rendering_identity(plan.rendering, protocol) for part, protocol in RENDERED.items()}
@@ -340,8 +340,8 @@ def rendering_identity(plan: RenderingPlan, protocol: str) -> dict[str, Any]:
     """Return JSON values of what draws the frames, but for the adapters; memories may be added."""
     checkpoint = find_checkpoint(plan.checkpoint)
     sampling = asdict(checkpoint.sampling_with(plan.sampling, protocol)) | plan.placement.changes()
-    code = code_of_others(("backbone", checkpoint.backbone))
-    return {"checkpoint": checkpoint.fingerprint, "sampling": sampling} | ({"code": code} if code else {})
+    code = code_json(("backbone", checkpoint.backbone))
+    return {"checkpoint": checkpoint.fingerprint, "sampling": sampling, **code}
 
 
 def adapter_identities(plan: RenderingPlan) -> dict[str, dict[str, Any]]:
