@@ -139,6 +139,10 @@ class CellGrid:
         """Return the numbers of the cells in which positions in world metres lie."""
         return numbers_at((positions.double() @ self.axes.T) / self.form.size)
 
+    def nearest_shift(self, by: Sequence[float]) -> Int64[Tensor, " 3"]:
+        """Return by how many cells along each axis things move that are told to by a vector, world metres."""
+        return ((self.axes @ torch.tensor(by, dtype=torch.float64)) / self.form.size).round().long()
+
     def centers(self) -> Float[Tensor, "first second level 3"]:
         """Return the centres of all cells in world metres, float64."""
         steps = [torch.arange(count) + low for count, low in zip(self.shape, self.corner, strict=True)]

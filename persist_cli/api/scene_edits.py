@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -85,8 +86,16 @@ class EditOutcome:
         uncovered: cells that were never seen, behind or below what was taken away, and hold something or nothing now.
         filled_by: what says what the uncovered cells hold: a model that imagines, their surroundings, or for some cells
             the one and for some the other; ``None`` where no cell was uncovered.
+        moved: how far the last edit that moves or copies took its cells, world metres: whole cells, or what else the
+            memory can do. ``None`` where there is no such edit; it went where it was told then, for all one knows.
     """
 
     changed: int
     uncovered: int = 0
     filled_by: FilledBy | None = None
+    moved: Point | None = None
+
+
+def last_vector(edits: Sequence[Edit]) -> Point | None:
+    """Return by what the last edit that moves or copies was told to, world metres; ``None`` where there is none."""
+    return next((edit.by for edit in reversed(edits) if isinstance(edit, Move | Copy)), None)

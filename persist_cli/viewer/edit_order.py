@@ -54,7 +54,7 @@ def moves(scene: Scene, boxes: Sequence[Box], by: Point, overwrite: bool, seed: 
         DataError: when one box holds a part of another one's thing, which would be cut in two.
     """
     grid, trial, edits = scene.cells, scene.copy(), []
-    shift = ((grid.axes @ torch.tensor(by, dtype=torch.float64)) / grid.form.size).round().long()
+    shift = grid.nearest_shift(by)
     parts = [_places(grid, box) for box in boxes]
     for number in _base_first(grid, parts, [float(np.dot(middle_of(box), by)) for box in boxes]):
         now = trial.cells.box(grid.corner, grid.shape)

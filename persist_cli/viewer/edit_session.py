@@ -171,8 +171,7 @@ class EditSession:
             edits += [Move(low=box.low, high=box.high, by=by, overwrite=overwrite) for box in boxes]
         outcome = self.apply(edits)
         names = {thing.box: thing.name for thing in self.things}
-        way = _in_whole_cells(cells_of_memory(self.edited), by)  # which may be another one than was asked for
-        shifted = [_shifted(box, way) for box in boxes]
+        shifted = [_shifted(box, outcome.moved or by) for box in boxes]
         self.selection = tuple(Selected(box, names.get(box, "")) for box in shifted)
         return outcome
 
@@ -272,11 +271,6 @@ def _box_around(cells: DrawnCells, chosen: Array) -> Box:
     reach = np.abs(cells.axes).T @ np.array(cells.size) / 2
     centers = cells.centers[chosen]
     return Box(_rounded(centers.min(axis=0) - reach), _rounded(centers.max(axis=0) + reach))
-
-
-def _in_whole_cells(cells: DrawnCells, by: Point) -> Point:
-    """Return by how much a map moves its cells when it is asked for a vector: by the nearest whole cells."""
-    return _rounded(np.rint(cells.axes @ np.array(by) / cells.size) * cells.size @ cells.axes)
 
 
 def _shifted(box: Box, by: Point) -> Box:

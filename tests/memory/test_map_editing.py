@@ -105,6 +105,22 @@ def test_after_all_was_removed_there_is_nothing_to_edit(room):
     assert len(room.points().positions)
 
 
+@pytest.mark.parametrize(
+    ("name", "cell", "by", "moved"),
+    [
+        ("voxel", FINE, (0.3, 20.13, 0.0), (0.25, 20.25, 0.0)),
+        ("map2d", FINE[:2], (0.3, 20.13, -0.6), (0.25, 0.0, -0.5)),
+    ],
+)
+def test_an_edit_says_how_far_it_went_in_whole_cells_and_along_the_ground_alone_where_the_map_is_flat(
+    name, cell, by, moved
+):
+    memory = written_memory(name, room_walk(4), cell=cell)
+    edits = [Copy(**BOX, by=by, overwrite=True), Paint(**BOX, color=(0, 0, 0))]
+    assert memory.edit(edits).moved == pytest.approx(moved, abs=1e-6)
+    assert memory.edit(edits[1:]).moved is None
+
+
 def test_moved_cells_are_edited_and_count_where_they_were_and_where_they_are(room):
     removed = written_memory("voxel", room_walk(4), cell=FINE).edit([Remove(**BOX)]).changed
     assert room.edit([Move(**BOX, by=(0.0, 20.0, 0.0))]).changed == 2 * removed

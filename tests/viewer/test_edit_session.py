@@ -246,6 +246,17 @@ def test_a_box_of_a_voxel_map_is_painted(voxel_map, tmp_path):
     assert session.things == []
 
 
+def test_the_selection_goes_as_far_as_the_cells_of_a_map(voxel_map, tmp_path):
+    memory = load_memory(voxel_map)
+    session = EditSession(memory, {}, tmp_path / "out.safetensors")
+    session.select_box(*memory.figures().bounds)
+    before = session.selection[0].box
+    size = memory.lattice.size.tolist()
+    session.shift((1.4 * size[0], 0.0, 0.0))
+    assert session.selection[0].box.low[0] - before.low[0] == pytest.approx(size[0], abs=1e-3)
+    assert session.selection[0].box.high[1:] == pytest.approx(before.high[1:])
+
+
 def test_a_rectangle_over_a_map_leaves_out_the_lowest_layer_around_what_stands_there(walks, voxel_map, tmp_path):
     memory = load_memory(voxel_map)
     session = EditSession(memory, {}, tmp_path / "out.safetensors")

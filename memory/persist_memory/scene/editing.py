@@ -13,7 +13,18 @@ from torch import Tensor
 
 from persist_cli.api.cell_things import box_of, ceiling_level, find_things, floor_level, structure
 from persist_cli.api.cells import FREE, OUTSIDE, Box, CellGrid, CellOrigin
-from persist_cli.api.scene_edits import Copy, Edit, EditOutcome, FilledBy, Insert, Move, Paint, Remove
+from persist_cli.api.scene_edits import (
+    Copy,
+    Edit,
+    EditOutcome,
+    FilledBy,
+    Insert,
+    Move,
+    Paint,
+    Point,
+    Remove,
+    last_vector,
+)
 from persist_cli.errors import DataError, hint
 from persist_memory.scene.support import free_below, standing_on
 from persist_memory.scene.surroundings import fill_from_surroundings, first_known, guess, repair_floor
@@ -69,7 +80,17 @@ def edit_grid(
     by_model = int((hidden & filled.known).sum())
     filled = fill_from_surroundings(filled, hidden & ~filled.known)
     uncovered = int((~grid.known & (filled.origins == CellOrigin.IMAGINED)).sum())
-    return filled, EditOutcome(int(changes(grid, filled).sum()), uncovered, _filled_by(uncovered, by_model))
+    changed, by_whom = int(changes(grid, filled).sum()), _filled_by(uncovered, by_model)
+    return filled, EditOutcome(changed, uncovered, by_whom, _moved(grid, edits))
+
+
+def _moved(grid: CellGrid, edits: Sequence[Edit]) -> Point | None:
+    """How far the last edit that moves or copies took its cells, world metres."""
+    by = last_vector(edits)
+    if by is None:
+        return None
+    x, y, z = (grid.nearest_shift(by).double() * grid.form.size @ grid.axes).tolist()
+    return x, y, z
 
 
 def _filled_by(uncovered: int, by_model: int) -> FilledBy | None:
@@ -226,7 +247,7 @@ def _carry(grid: CellGrid, edit: Move | Copy) -> Cells:
     targets, floor = _targets(grid, edit), floor_level(grid)
     for rider in standing_on(grid, targets) if isinstance(edit, Move) else ():
         targets[tuple(rider.T)] = True
-    shift = ((grid.axes @ torch.tensor(edit.by, dtype=torch.float64)) / grid.form.size).round().long()
+    shift = grid.nearest_shift(edit.by)
     if not bool(shift.any()):
         raise DataError(f"by {_point_text(edit.by)} is less than half a cell of {grid.form.size:g} m")
     places = targets.nonzero()
