@@ -220,6 +220,20 @@ def test_the_learning_rate_falls_to_zero_over_the_cooldown():
     assert rates[80:] == pytest.approx([2 * left / 21 for left in range(20, 0, -1)])
 
 
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({"steps": 3, "warmup": 0}, [1, 1, 1]),
+        ({"steps": 4, "warmup": 4, "cooldown": 4}, [0.25, 0.5, 0.4, 0.2]),
+        ({"steps": 8, "warmup": 4, "schedule": "cosine"}, [0.25, 0.5, 0.75, 1, 1, 0.5 + 8**-0.5, 0.5, 0.5 - 8**-0.5]),
+        ({"steps": 4, "warmup": 0, "cooldown": 3, "schedule": "cosine"}, [1, 0.75, 0.5, 0.5 - 8**-0.5]),
+    ],
+)
+def test_the_learning_rate_is_the_lowest_of_warmup_cosine_and_cooldown(settings, expected):
+    training = TrainingSettings(learning_rate=1.0, **settings)
+    assert [learning_rate(training, step) for step in range(training.steps)] == pytest.approx(expected)
+
+
 def test_an_unknown_missing_or_broken_recipe_is_one_line(tmp_path):
     (tmp_path / "a.yaml").write_text("stage: [")
     (tmp_path / "b.yaml").write_text("- 1")

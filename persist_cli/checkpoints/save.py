@@ -114,11 +114,11 @@ def asked_sampling(backbone: Backbone, base: Checkpoint | None) -> dict[str, Any
     That of a distilled base is not kept, for the training undoes it, and no autoguidance, for the guide is not written.
     """
     own = own_sampling(backbone)
-    if own or base is None or base.sampling is None or base.sampling.sampler == CONSISTENCY:
+    if own or base is None or (base.sampling is not None and base.sampling.sampler == CONSISTENCY):
         return own
     alone = {"autoguidance": 1.0}
     protocols = {name: dataclasses.asdict(sampling) | alone for name, sampling in base.protocol_sampling.items()}
-    kept = {"sampling": dataclasses.asdict(base.sampling) | alone}
+    kept = {} if base.sampling is None else {"sampling": dataclasses.asdict(base.sampling) | alone}
     return kept | ({"protocol_sampling": protocols} if protocols else {})
 
 

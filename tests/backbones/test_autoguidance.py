@@ -76,6 +76,15 @@ def test_it_goes_beyond_the_guide_at_the_noisier_half_of_the_levels(
             assert torch.equal(made["guided"], made["model"])
 
 
+def test_it_begins_at_what_guidance_over_memory_comes_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sampling = Sampling(1, memory_guidance=2.0, autoguidance=3.0)
+    seen = predictions(model_and_guide(tmp_path), sampling, monkeypatch, random_tokens(1, 5))
+    assert [name for name, *_ in seen] == ["model", "model", "guide", "guided"]
+    told, without, weaker, guided = (made for *_, made in seen)
+    assert not torch.equal(told, without)
+    torch.testing.assert_close(guided, weaker + 3 * (without + 2 * (told - without) - weaker))
+
+
 def test_a_guide_that_is_the_model_itself_changes_nothing(tmp_path: Path) -> None:
     model = micro()
     shaken(model)

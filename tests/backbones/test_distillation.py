@@ -47,6 +47,11 @@ def test_each_level_is_followed_by_the_next_and_the_last_by_the_clean_clip():
     assert last.tolist() == [False, False, False, True]
 
 
+def test_each_level_is_drawn_and_no_other():
+    levels = Levels(4, 1000)
+    assert set(levels.draw(sample_generators(range(64))).tolist()) == set(levels.timesteps.tolist())
+
+
 def test_the_teachers_step_to_the_true_clip_leaves_its_noise_as_it_is():
     scheduler, draw = micro().scheduler, torch.Generator().manual_seed(0)
     clean, noise = torch.randn(2, 3, 4, 2, 2, generator=draw), torch.randn(2, 3, 4, 2, 2, generator=draw)
@@ -207,6 +212,18 @@ def test_the_distances_are_zero_for_equal_latents_and_nearly_absolute_for_others
     assert distance(one, other, "squared").flatten().tolist() == [0.0, 9.0]
 
 
+@pytest.mark.parametrize("loss", ["huber", "squared"])
+def test_the_loss_is_the_distance_that_the_settings_name(loss):
+    student, clips = shaken_micro(), random_clips(2)
+    distillation, generators = distilled(student, loss=loss), sample_generators(clips.seeds)
+    noised = student.add_noise(clips, generators, distillation.levels.draw)
+    states = [generator.get_state() for generator in generators]
+    with torch.no_grad():
+        target = consistency_target(clips, noised, states, distillation)
+        expected = distance(predict_clean(student, clips, noised, states), target, loss).mean()
+        assert torch.equal(consistency_loss(student, clips, distillation)["loss"], expected)
+
+
 def test_a_distilled_model_asks_for_few_steps_without_guidance():
     student = shaken_micro()
     student.distill(Distill(steps=2, guidance=1.5), copy.deepcopy(student), copy.deepcopy(student))
@@ -249,10 +266,20 @@ def test_a_teacher_that_does_not_know_what_it_is_given_is_refused(own, others, w
         student.distill(Distill(), teacher, copy.deepcopy(student))
 
 
-def test_a_teacher_may_know_more_noise_and_depth_than_the_student():
+def test_a_teacher_may_know_more_noise_and_depth_than_the_student_which_learns_no_depth():
     student, teacher = micro(**FRAMEWISE, depth=False), micro(**FRAMEWISE, image_noise=0.3)
     student.distill(Distill(), teacher, copy.deepcopy(student))
-    assert student(random_clips(2), "1")["loss"] >= 0
+    losses = student(random_clips(2), "1")
+    assert set(losses) == {"loss", "rgb"}
+    assert losses["loss"] == losses["rgb"]
+
+
+def test_a_teacher_of_other_noise_levels_is_refused():
+    student = micro(**FRAMEWISE)
+    teacher = copy.deepcopy(student)
+    teacher.scheduler.alphas_cumprod = teacher.scheduler.alphas_cumprod.flip(0)
+    with pytest.raises(CheckpointError, match=r"^distill\.teacher: its noise levels differ"):
+        student.distill(Distill(), teacher, copy.deepcopy(student))
 
 
 def test_a_teacher_with_another_adapter_is_refused():

@@ -141,6 +141,15 @@ def test_a_model_trained_on_is_sampled_as_its_base_unless_that_is_distilled(expo
     assert trained.sampling_with(SamplingOverrides(), "return") == expected
 
 
+def test_a_model_trained_on_keeps_the_sampling_of_a_protocol_where_its_base_has_no_other(export, tmp_path):
+    export(tmp_path / "m", "--sampling-for", "return:steps=20")
+    base = find_checkpoint(tmp_path / "m")
+    (tmp_path / "on").mkdir()
+    save_base(load_backbone(base), tmp_path / "on", base=base)
+    trained = find_checkpoint(tmp_path / "on")
+    assert (trained.sampling, trained.protocol_sampling) == (None, {"return": Sampling(20)})
+
+
 def test_a_low_rank_change_is_sampled_as_the_base_that_it_changes(export, tmp_path):
     export(tmp_path / "m", "--steps", "4", "--sampler", "unipc", "--sampling-for", "return:steps=20")
     base = find_checkpoint(tmp_path / "m")

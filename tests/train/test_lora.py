@@ -17,11 +17,12 @@ from diffusers import (
 )
 
 from persist_backbones.cogvideox.config import CogVideoXSettings
-from persist_backbones.cogvideox.parts import make_parts, weights_digest
+from persist_backbones.cogvideox.parts import make_parts, merge_lora, weights_digest
 from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.api.stages import Lora
 from persist_cli.checkpoints.load import load_backbone
-from persist_cli.io.files import read_tensors
+from persist_cli.errors import CheckpointError
+from persist_cli.io.files import read_tensors, write_tensors
 from tests.support.damage import without_sums
 from tests.support.micro_model import micro, predicted, random_clips
 from tests.support.micro_runs import MICRO, MICRO_SETTINGS, equal_runs, run_persist, stage
@@ -198,6 +199,22 @@ def test_each_impossible_use_of_lora_ends_in_one_line(persist, walks, stage1, co
     monkeypatch.setitem(sys.modules, "peft", None)
     ended = persist(*stage("stage1", walks, tmp_path / "a", base, *LORA))
     assert (ended.code, ended.err.count("pip install 'persist-cli[lora]'")) == (1, 1)
+
+
+def test_a_file_that_does_not_fit_its_base_or_does_not_say_its_scale_is_refused(tmp_path):
+    backbone, path = micro(), tmp_path / "pytorch_lora_weights.safetensors"
+    backbone.add_lora(Lora(rank=2))
+    backbone.save_lora(tmp_path)
+    base, larger = micro().transformer.base, micro(transformer=MICRO["transformer"] | {"num_attention_heads": 3})
+    with pytest.raises(CheckpointError, match="does not fit this model at 'transformer_blocks"):
+        merge_lora(larger.transformer.base, tmp_path, check=False)
+    tensors, metadata = read_tensors(path)
+    write_tensors(path, {name: tensor for name, tensor in tensors.items() if ".lora_B." not in name}, metadata)
+    with pytest.raises(CheckpointError, match="does not fit this model at 'transformer_blocks"):
+        merge_lora(base, tmp_path, check=False)
+    write_tensors(path, tensors)
+    with pytest.raises(CheckpointError, match="it does not say its rank and alpha"):
+        merge_lora(base, tmp_path, check=False)
 
 
 def test_a_damaged_lora_file_or_another_base_ends_in_one_line(persist, walks, stage1, lora, tmp_path):

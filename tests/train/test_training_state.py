@@ -74,6 +74,33 @@ def test_the_averaged_weights_are_there_within_the_block_alone_even_where_it_fai
     assert not torch.equal(last, state.averages()["weight"])
 
 
+def test_a_count_of_steps_goes_on_as_the_kind_of_number_that_its_optimizer_keeps(tmp_path):
+    state = fresh_state()
+    weight, bias = state.parameters.values()
+    state.moments[weight], state.moments[bias] = {"step": 5}, {"step": torch.tensor(5.0)}  # of 8 bits, and torch's
+    other = reread(state, tmp_path)
+    plain, tensor = (other.moments[parameter]["step"] for parameter in other.parameters.values())
+    assert (type(plain), plain) == (int, 5)
+    assert torch.equal(tensor, torch.tensor(5.0))
+
+
+class Elsewhere(nn.Parameter):
+    """A parameter that says it is on another device than the average of it."""
+
+    device = torch.device("meta")
+
+
+def test_an_average_follows_weights_on_another_device_as_slowly():
+    here, away = (kind(torch.zeros(3)) for kind in (nn.Parameter, Elsewhere))
+    averages = [make_average([weight], TrainingSettings(ema=0.9)) for weight in (nn.Parameter(torch.zeros(3)), here)]
+    for step in range(3):
+        for weight, average in zip((here, away), averages, strict=True):
+            weight.data.add_(step)
+            update_average(average, [weight])
+    assert torch.equal(averages[0].shadow_params[0], averages[1].shadow_params[0])
+    assert not torch.equal(averages[0].shadow_params[0], here)
+
+
 def test_a_state_of_other_weights_is_refused(tmp_path):
     state = fresh_state()
     write_json(tmp_path / "training.json", state.write(tmp_path, main=True))
