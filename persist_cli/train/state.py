@@ -108,7 +108,7 @@ class TrainingState:
             write_shards(folder / SHARDS_FOLDER, tensors)
             return notes | {"files": len(list((folder / SHARDS_FOLDER).iterdir()))}
         if main:
-            write_tensors(folder / STATE_FILE, _in_memory_of_their_own(tensors))
+            write_tensors(folder / STATE_FILE, tensors)
         return notes
 
     def read(self, folder: Path) -> None:
@@ -244,21 +244,6 @@ def _shared_folder_aside(path: Path) -> Iterator[Path]:
         name = [str(aside)]
         broadcast_object_list(name)
         yield Path(name[0])
-
-
-def _in_memory_of_their_own(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Copy the tensors that share memory, which safetensors does not write.
-
-    DeepSpeed's parameters are pieces of one tensor; those of bitsandbytes share the tables that their bytes stand for.
-    """
-    seen: set[int] = set()
-    separate: dict[str, Tensor] = {}
-    for name, tensor in tensors.items():
-        storage = tensor.untyped_storage()
-        shared = storage.data_ptr() in seen or storage.nbytes() != tensor.nbytes
-        seen.add(storage.data_ptr())
-        separate[name] = tensor.detach().clone() if shared else tensor
-    return separate
 
 
 def _moments_by_parameter(tensors: dict[str, Tensor]) -> dict[str, dict[str, Tensor]]:
