@@ -65,3 +65,20 @@ def test_free_places_are_those_that_can_be_reached_from_the_start_at_its_height(
     assert float(places[:, 0].max()) < 3.0
     assert len(places) > 0.8 * 28 * 40
     assert places[:, 2] == pytest.approx(1.3)
+
+
+def test_free_places_are_the_middles_of_free_squares_at_the_mean_height_of_the_starts():
+    ground = walled()
+    places = KnownGround(ground, 0.2, TaskSettings()).free_places(torch.tensor([[1.0, 1.0, 1.2], [1.5, 1.0, 1.4]]))
+    squares = ground.places(places) / 0.1 - 0.5
+    assert torch.allclose(squares, squares.round(), atol=1e-4)
+    assert squares.amin(0).tolist() == pytest.approx([0.0, 0.0], abs=1e-4)
+    assert places[:, 2] == pytest.approx(1.3)
+
+
+def test_a_place_behind_a_wall_that_parts_the_house_cannot_be_reached():
+    ground = walled()
+    ground.states[30:, 30] = int(Cover.OCCUPIED)
+    places = torch.tensor([[1.0, 3.0, 1.0], [5.0, 1.0, 1.0]]).double()
+    known = KnownGround(ground, 0.2, TaskSettings())
+    assert known.can_reach(places, torch.tensor([[2.0, 1.0, 1.0]]).double()).tolist() == [True, False]

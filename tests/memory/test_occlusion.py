@@ -8,6 +8,9 @@ from persist_cli.api.geometry import unproject
 from persist_cli.api.observations import Origin
 from persist_memory.grid import occlusion
 from persist_memory.grid.occlusion import (
+    _boxes,
+    _touches,
+    closed,
     covered,
     covered_by_blocks,
     with_enough_new,
@@ -64,6 +67,52 @@ def test_cells_side_by_side_leave_no_hole_in_images_with_oblong_pixels(focal):
     steps = torch.arange(-60, 61, dtype=torch.float64) * 0.1
     wall = torch.cartesian_prod(steps, steps, torch.tensor([2.0], dtype=torch.float64))
     assert covered(wall, 0.1, camera).all()
+
+
+@pytest.mark.parametrize(("size", "depth"), [((50, 70), 2.0), ((50, 70), 0.06), ((64, 64), 0.3)])
+def test_cells_side_by_side_leave_no_hole_in_images_of_any_size_and_however_near_they_are(size, depth):
+    matrix = torch.tensor([[32.0, 0.0, size[1] / 2], [0.0, 32.0, size[0] / 2], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    camera = Cameras(torch.eye(4, dtype=torch.float64)[None], matrix[None], *size)
+    steps = torch.arange(-30, 31, dtype=torch.float64) * 0.1
+    wall = torch.cartesian_prod(steps, steps, torch.tensor([depth], dtype=torch.float64))
+    assert covered(wall, 0.1, camera).all()
+    assert not covered(wall + torch.tensor([0.0, 0.0, 0.04 - depth]), 0.1, camera).any()  # around the camera itself
+
+
+@pytest.mark.parametrize("focal", [(60.0, 20.0), (20.0, 60.0), (100.0, 100.0), (12.0, 12.0)])
+def test_no_cell_of_a_block_is_drawn_beyond_the_pixels_that_are_looked_at_for_it(focal):
+    matrix = torch.tensor([[focal[0], 0.0, 32.0], [0.0, focal[1], 24.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    camera = Cameras(torch.eye(4, dtype=torch.float64)[None], matrix[None], 48, 64)
+    draw = torch.Generator().manual_seed(0)
+    low, high = torch.tensor([[-3.0, -3.0, 0.1], [3.0, 3.0, 3.0]])
+    centers = low + torch.rand(800, 3, generator=draw, dtype=torch.float64) * (high - low)
+    away = torch.nn.functional.normalize(torch.randn(800, 3, generator=draw, dtype=torch.float64), dim=1)
+    away[::2] = away[::2].sign() * torch.eye(3)[torch.arange(400) % 2]  # to the very side of the block
+    boxes = _boxes(centers, 0.2, 0.1, camera)
+    for cell, (left, top, right, bottom) in zip(centers + 0.2 * away, boxes.tolist(), strict=True):
+        drawn = covered(cell[None], 0.1, camera)[0]
+        drawn[top:bottom, left:right] = False
+        assert not drawn.any(), (cell, left, top, right, bottom)
+
+
+def test_a_box_is_touched_by_a_single_pixel_in_its_corner_and_by_none_beside_it():
+    box, touched = torch.tensor([[2, 3, 5, 7]]), torch.zeros(10, 8, dtype=torch.bool)  # left, top, right, bottom
+    for row in range(10):
+        for column in range(8):
+            pixel = torch.zeros(10, 8, dtype=torch.bool)
+            pixel[row, column] = True
+            touched[row, column] = _touches(pixel, box)[0]
+    inside = torch.zeros(10, 8, dtype=torch.bool)
+    inside[3:7, 2:5] = True
+    assert torch.equal(touched, inside)
+
+
+def test_a_pixel_is_closed_where_just_the_share_around_it_is_known_and_beyond_the_image_nothing_is():
+    known = torch.zeros(1, 6, 6, dtype=torch.bool)
+    known[:, :, 2] = True
+    assert closed(known, 1 / 3)[0, 3].tolist() == [False, True, True, True, False, False]
+    assert closed(known, 1 / 3)[0, 0].tolist() == [False, False, True, False, False, False]
+    assert torch.equal(closed(known, 0.34), known)
 
 
 @pytest.mark.parametrize("at_once", [1, 300])

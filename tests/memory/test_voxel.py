@@ -256,3 +256,14 @@ def test_a_read_of_few_cells_holds_the_nearest_of_all_blocks(budget, monkeypatch
     memory, cameras = written_memory("voxel", room_walk(8), cell=(0.05, 0.05, 0.05)), room_walk(8).cameras[:1]
     whole = memory.read(cameras, 1_000_000)
     assert torch.equal(memory.read(cameras, budget).positions, whole.positions[:budget])
+
+
+def test_a_read_of_few_cells_takes_those_at_the_near_side_of_a_farther_block(monkeypatch):
+    monkeypatch.setattr(visibility, "FIRST_CELLS", 1)
+    views = room_walk(8)
+    memory = written_memory("voxel", views, cell=(0.1, 0.1, 0.1))
+    for number in range(8):
+        camera = views.cameras[number : number + 1]
+        whole = memory.read(camera, 1_000_000).positions
+        for budget in (1, 3, 10, 30, 100):
+            assert torch.equal(memory.read(camera, budget).positions, whole[:budget]), (number, budget)

@@ -14,7 +14,7 @@ from persist_cli.api.cameras import Cameras
 from persist_cli.api.checkpoint import POLICY_CARD
 from persist_cli.api.observations import Observations
 from persist_cli.data.check.convention import ConventionCheck, hypotheses
-from persist_cli.data.check.inspect import check_table, figures_table, trajectory_figures
+from persist_cli.data.check.inspect import check_table, figures_table, trajectory_figures, verdict_line
 from persist_cli.data.check.others import describe_other
 from persist_cli.data.check.reprojection import ReprojectionErrors
 from persist_cli.data.store import Store, TrajectoryFile, write_trajectory
@@ -65,6 +65,31 @@ def test_the_table_of_the_check_has_shares_in_percent() -> None:
     rows = dict(check_table(check))
     assert (rows["depth error over depth, median"], rows["occluded"]) == ("1.20 %", "25.00 %")
     assert rows["depth error, 95 % of what is not occluded"] == "none"
+
+
+def test_the_table_of_the_check_says_which_colours_are_reprojected_and_how_far_depth_is_off() -> None:
+    figures = {"median_metres": 0.01, "p95_metres": 0.25, "median_relative": 0.0, "occluded": 0.0, "median_pixels": 0.5}
+    rows = dict(check_table(ConventionCheck("ok", "", [], 3, 2, **figures, color_warped=3.0, color_unwarped=9.0)))
+    assert (rows["colour error, reprojected"], rows["colour error, same pixel"]) == ("3.0 of 255", "9.0 of 255")
+    assert (rows["depth error, median"], rows["depth error, 95 % of what is not occluded"]) == ("0.0100 m", "0.2500 m")
+
+
+def test_the_verdict_names_the_cause_or_what_the_data_cannot_show() -> None:
+    wrong, unsure = ConventionCheck("suspicious", "a cause", [], 1, 1), ConventionCheck("ok", "", ["a", "b"], 1, 1)
+    assert verdict_line(wrong) == "suspicious: a cause"
+    assert verdict_line(unsure) == "ok, but this motion would not show: a, b"
+    assert verdict_line(replace(unsure, undecided=[])) == "ok: cameras, depth and poses agree"
+
+
+def test_of_many_sizes_the_three_most_frequent_are_named_and_the_cells_of_scenes_are_counted(tmp_path: Path) -> None:
+    one = trajectory_figures(TrajectoryFile(ROOM.write(tmp_path / "walk.parquet", np.stack([look((0, 1.4, 0), 0)]))))
+    sides = [1, 2, 3, 3, 4, 4, 5, 5]
+    figures = [replace(one, size=(side, side), cells=side > 3, world_up_is="given" * (side > 4)) for side in sides]
+    rows = dict(figures_table(figures, {}))
+    assert rows["image size"] == "3×3, 4×4, 5×5 and 2 more"
+    assert rows["trajectories with the cells of their scene"] == "4"
+    assert rows["up axis is"] == "given"
+    assert not {"trajectories with the cells of their scene", "up axis is"} & {*dict(figures_table(figures[:3], {}))}
 
 
 def test_a_point_behind_what_the_other_frame_sees_is_occluded_and_none_before_it() -> None:

@@ -113,6 +113,13 @@ def test_where_no_image_can_be_read_the_first_one_is_named(name: str, capture: P
         read(name, capture)
 
 
+@pytest.mark.parametrize("format", ["scannet", "nerfstudio"])
+def test_frames_come_in_the_order_of_their_numbers_without_leading_zeros(format: str, tmp_path: Path) -> None:
+    frames = read(format, FORMATS[format][1](tmp_path / "room", 11)).frames
+    found = [frame.world_from_camera for frame in frames if not isinstance(frame, DataError)]
+    assert np.allclose(found, poses(11), atol=1e-6)
+
+
 def rewrite(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
     values = json.loads(path.read_text())
     change(values)
@@ -278,6 +285,17 @@ def test_a_broken_scan_is_one_line(tmp_path: Path, breaks: Callable[[Path], obje
     assert "\n" not in str(caught.value)
 
 
+def test_nearly_the_same_camera_is_that_of_the_poses_and_a_colour_image_may_have_a_name_in_capitals(
+    tmp_path: Path,
+) -> None:
+    scan = write_scannet(tmp_path / "scene0000_00", 2)
+    almost = np.eye(4)
+    almost[0, 3] = 5e-4
+    np.savetxt(scan / "intrinsic/extrinsic_color.txt", almost)
+    (scan / "color/1.png").rename(scan / "color/1.PNG")
+    assert not any(isinstance(frame, DataError) for frame in read("scannet", scan).frames)
+
+
 # --- nerfstudio
 
 
@@ -308,6 +326,16 @@ def test_the_lens_of_nerfstudio_is_read_whole_from_a_file_of_any_place(
     assert read("nerfstudio", Path("transforms.json")).name == "room"
 
 
+@pytest.mark.parametrize("model", ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE"])
+def test_a_pinhole_camera_of_nerfstudio_has_many_names_and_one_focal_length_is_enough(
+    tmp_path: Path, model: str
+) -> None:
+    capture = write_nerfstudio(tmp_path / "room", 1)
+    rewrite(capture / "transforms.json", lambda values: values.update(camera_model=model) or values.pop("fl_y"))
+    lens = read_transforms(capture / "transforms.json").frames[0].lens
+    assert lens.fy == lens.fx == 2 * ROOM.intrinsics[0, 0]
+
+
 def set_values(**changes: Any) -> Callable[[dict[str, Any]], None]:
     return lambda values: values.update(changes)
 
@@ -323,6 +351,7 @@ def set_first(**changes: Any) -> Callable[[dict[str, Any]], None]:
         (set_values(frames=[{}]), "transforms.json: frame 0 has no file_path"),
         (set_values(camera_model="OPENCV_FISHEYE"), "a OPENCV_FISHEYE camera; undistort the images"),
         (set_values(is_fisheye=True), "a fisheye camera; undistort the images"),
+        (set_values(fl_y=0), "its intrinsics are none of OpenCV's pinhole camera"),
         (set_values(k4=0.1), "its intrinsics are none of OpenCV's pinhole camera"),
         (set_values(fl_x="wide"), "its intrinsics are not numbers"),
         (set_values(h=float("inf")), "its intrinsics are not numbers"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -216,6 +217,51 @@ def test_codes_in_proportion_are_read_too() -> None:
     code = DepthCode.of(ImageFeature.of("depth", {"dtype": "video", "shape": [2, 2], "info": info}))
     metres = code.metres(np.array([[0, 1], [1000, 4095]], np.uint16))
     assert metres == pytest.approx(np.array([[0, 0.001], [1, 0]], np.float32))  # the last may be farther
+
+
+def test_codes_are_those_of_lerobot_where_the_feature_says_nothing_of_them() -> None:
+    code = DepthCode.of(ImageFeature.of("depth", {"dtype": "video", "shape": [2, 2], "info": {"is_depth_map": True}}))
+    assert code == DepthCode(nearest=0.01, farthest=10.0, shift=3.5, by_logarithm=True)
+
+
+@pytest.mark.parametrize(("kind", "unit"), [("m", "mm"), ("mm", "m")])
+def test_the_unit_of_depth_images_is_the_one_that_the_feature_says(tmp_path: Path, kind: str, unit: str) -> None:
+    dataset = write_lerobot(tmp_path / "room", (1,), stored=kind)
+    usual = next(read_all(dataset)[0].frames).depth
+    change_info(dataset, lambda info: info["features"][DEPTH]["info"].update(depth_unit=unit))
+    factor = {"mm": 0.001, "m": 1000.0}[unit]
+    assert next(read_all(dataset)[0].frames).depth == pytest.approx(factor * usual)
+
+
+def test_images_that_were_stored_smaller_have_a_camera_of_their_size(tmp_path: Path) -> None:
+    dataset = write_lerobot(tmp_path / "room", (2,), stored="mm")
+    frames = list(ROOM.frames(poses(2, "quaternion")[1]))
+    smaller = {
+        COLOR: [picture(frame.rgb[::2, ::2], "PNG") for frame in frames],
+        DEPTH: [picture(stored_depth(frame.depth, "mm")[::2, ::2], "TIFF") for frame in frames],
+    }
+    change_table(dataset, "data", lambda rows: rows.update(smaller))
+    info = read_all(dataset)[0].info
+    assert (info.height, info.width) == (24, 32)
+    assert info.intrinsics[:2] == pytest.approx(ROOM.intrinsics[:2] / 2)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda info: info.update(fps=11),
+        lambda info: info["features"]["observation.pose"].update(names=None),
+        lambda info: info["features"][COLOR]["info"].update({"video.fps": 11}),
+    ],
+)
+def test_an_episode_whose_rate_pose_or_colours_are_described_otherwise_is_another_one(
+    tmp_path: Path, change: Callable[[dict[str, Any]], object]
+) -> None:
+    dataset, settings = write_lerobot(tmp_path / "room", (2,), "planar"), {"pose": "observation.pose", "axes": "robot"}
+    run_import("lerobot", dataset, tmp_path / "out", ImportPlan(), True, settings)
+    change_info(dataset, change)
+    with pytest.raises(DataError, match="holds another trajectory"):
+        run_import("lerobot", dataset, tmp_path / "out", ImportPlan(), True, settings)
 
 
 def test_a_video_is_decoded_once_where_episodes_follow_each_other(
