@@ -28,6 +28,7 @@ from persist_cli.environments.task import (
 from persist_cli.errors import DataError
 
 RENDER_MODES = ["rgb_array"]
+RESET_FIRST = "reset() comes before step() and render()"
 
 
 class Scenes(ABC):
@@ -80,7 +81,7 @@ class HouseEnv(gymnasium.Env[Observation, Any]):
     def attempt(self) -> Attempt:
         """The present episode; ``gymnasium.error.ResetNeeded`` before the first."""
         if self._attempt is None:
-            raise ResetNeeded("reset() comes before step() and render()")
+            raise ResetNeeded(RESET_FIRST)
         return self._attempt
 
     def reset(
@@ -163,8 +164,7 @@ class HouseVectorEnv(VectorEnv[Observation, Array, Array]):
         Raises:
             DataError: when they are not of the action space; nothing was done then.
         """
-        if not self._attempts:
-            raise ResetNeeded("reset() comes before step()")
+        self._check_begun()
         if np.ndim(actions) == 0 or len(actions) != self.num_envs:
             raise DataError(f"actions of shape {np.shape(actions)}: {self.num_envs} environments take one each")
         names = {n: named(action, self.actions, self.scenes.task.chunk) for n, action in enumerate(actions)}
@@ -179,7 +179,12 @@ class HouseVectorEnv(VectorEnv[Observation, Array, Array]):
         """Return what each agent sees now; ``None`` without a render mode."""
         if self.render_mode != "rgb_array":
             return None
+        self._check_begun()
         return tuple(attempt.now.rgb.copy() for attempt in self._attempts)
+
+    def _check_begun(self) -> None:
+        if not self._attempts:
+            raise ResetNeeded(RESET_FIRST)
 
     def _is_over(self, attempt: Attempt) -> bool:
         return self.max_episode_steps is not None and attempt.steps >= self.max_episode_steps

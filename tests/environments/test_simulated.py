@@ -160,6 +160,8 @@ def test_straight_metres_lead_through_walls_also_where_goals_are_drawn():
 
 def test_a_vector_shows_what_each_of_its_agents_sees():
     vector = gymnasium.make_vec(NAME, num_envs=2, render_mode="rgb_array", **HOUSES)
+    with pytest.raises(ResetNeeded, match="before step\\(\\) and render\\(\\)"):
+        vector.render()
     seen = vector.reset(seed=3)[0]["rgb"]
     assert all(np.array_equal(*pair) for pair in zip(vector.render(), seen, strict=True))
     assert not np.array_equal(*seen)
