@@ -4,9 +4,12 @@ import pytest
 import torch
 from transformers import CLIPConfig, CLIPModel, CLIPVisionConfig, CLIPVisionModel
 
+from persist_cli.api.checkpoint import find_checkpoint
 from persist_cli.errors import CheckpointError
+from persist_cli.io.files import read_json
 from persist_memory.encoders.clip import CLIP_MEAN, CLIP_STD, Clip, ClipSettings
 from persist_memory.encoders.random_vit import RandomVit, RandomVitSettings
+from tests.support.micro_runs import SHORT, losses
 from tests.support.room_views import room_walk
 
 VISION = {
@@ -45,6 +48,18 @@ def test_clip_stops_at_a_block_in_the_middle_and_no_frame_depends_on_another(tin
     middle = Clip(ClipSettings(weights=str(tiny_clip), layer=2))
     assert not torch.allclose(middle.encode(rgb), Clip(ClipSettings(weights=str(tiny_clip))).encode(rgb))
     assert torch.equal(middle.encode(rgb)[1], middle.encode(rgb[1:])[0])
+
+
+def test_the_papers_form_trains_on_features_of_clip(persist, tiny_clip, walks, stage1, tmp_path):
+    weights = f"memory.encoder_settings.weights={tiny_clip}"
+    command = ("finetune", "houses-64-paper-clip", "--data", walks, "--out", tmp_path, f"base={stage1}", weights)
+    few = ("data.clip_frames=[9]", "training.steps=2", "training.cooldown=0", "training.precision=no")
+    trained = persist(*command, *SHORT, *few, "training.frozen_precision=no")
+    assert trained.code == 0, trained.err
+    memory = read_json(find_checkpoint(tmp_path).adapter_folder("voxel") / "memory.json")
+    assert (memory["encoder"], memory["encoder_settings"]["weights"]) == ("clip", str(tiny_clip))
+    first, last = losses(tmp_path)
+    assert first != last
 
 
 def test_weights_that_lack_a_part_are_refused_and_not_made_up(tiny_clip, tmp_path):
