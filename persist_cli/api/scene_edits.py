@@ -86,8 +86,8 @@ class EditOutcome:
         uncovered: cells that were never seen, behind or below what was taken away, and hold something or nothing now.
         filled_by: what says what the uncovered cells hold: a model that imagines, their surroundings, or for some cells
             the one and for some the other; ``None`` where no cell was uncovered.
-        moved: how far the last edit that moves or copies took its cells, world metres: whole cells, or what else the
-            memory can do. ``None`` where there is no such edit; it went where it was told then, for all one knows.
+        moved: how far the last edit that moves or copies took its cells, world metres, since cells move by whole ones.
+            ``None`` where there is no such edit, or the memory does not say.
     """
 
     changed: int
