@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Metres = Annotated[float, Field(allow_inf_nan=False)]
 Point = tuple[Metres, Metres, Metres]
@@ -96,6 +99,15 @@ class EditOutcome:
     moved: Point | None = None
 
 
-def last_vector(edits: Sequence[Edit]) -> Point | None:
-    """Return by what the last edit that moves or copies was told to, world metres; ``None`` where there is none."""
-    return next((edit.by for edit in reversed(edits) if isinstance(edit, Move | Copy)), None)
+def last_moved(edits: Sequence[Edit], in_whole_cells: Callable[[Point], Tensor]) -> Point | None:
+    """Return ``EditOutcome.moved`` of some edits.
+
+    Args:
+        edits: done one after the other.
+        in_whole_cells: returns how far cells move that are told to by a vector; both world metres.
+    """
+    by = next((edit.by for edit in reversed(edits) if isinstance(edit, Move | Copy)), None)
+    if by is None:
+        return None
+    x, y, z = in_whole_cells(by).tolist()
+    return x, y, z

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from persist_cli.api.cells import CellOrigin
 from persist_cli.api.encoder import Encoder
-from persist_cli.api.scene_edits import Copy, Edit, EditOutcome, Insert, Move, Paint, Point, Remove, last_vector
+from persist_cli.api.scene_edits import Copy, Edit, EditOutcome, Insert, Move, Paint, Point, Remove, last_moved
 from persist_cli.errors import DataError
 from persist_memory.grid.pooling import Lattice
 from persist_memory.grid.storage import LIMIT, pack
@@ -48,6 +48,14 @@ class MapForm:
         """The axis of the lattice that is (nearly) vertical."""
         return int((self.lattice.grid_from_world @ torch.tensor(self.world_up, dtype=torch.float64)).abs().argmax())
 
+    def nearest_shift(self, by: Point) -> Int64[Tensor, " 3"]:
+        """Return by how many cells along each axis cells move that are told to by a vector, world metres."""
+        steps = (self.lattice.grid_from_world @ torch.tensor(by, dtype=torch.float64)) / self.lattice.size
+        shift: Int64[Tensor, " 3"] = steps.round().clamp(-2 * LIMIT, 2 * LIMIT).long()
+        if self.lattice.flat:
+            shift[self.height_axis] = 0
+        return shift
+
 
 def edit_cells(
     tensors: Mapping[str, Tensor], form: MapForm, edits: Sequence[Edit]
@@ -69,16 +77,9 @@ def edit_cells(
         except DataError as error:
             raise DataError(f"edit {number} ({edit.edit}): {error}") from error
         changed += count
-    return edited, EditOutcome(changed, moved=_moved(form, edits))
-
-
-def _moved(form: MapForm, edits: Sequence[Edit]) -> Point | None:
-    """How far the last edit that moves or copies took its cells, world metres."""
-    by = last_vector(edits)
-    if by is None:
-        return None
-    x, y, z = (_nearest_shift(form, by) * form.lattice.size @ form.lattice.grid_from_world).tolist()
-    return x, y, z
+    lattice = form.lattice
+    moved = last_moved(edits, lambda by: form.nearest_shift(by) * lattice.size @ lattice.grid_from_world)
+    return edited, EditOutcome(changed, moved=moved)
 
 
 def _apply(tensors: dict[str, Tensor], form: MapForm, edit: Edit) -> tuple[dict[str, Tensor], int]:
@@ -139,7 +140,7 @@ def _painted(
 
 def _shifted(taken: Mapping[str, Tensor], form: MapForm, edit: Move | Copy) -> dict[str, Tensor]:
     """Return cells at their new places."""
-    shift = _nearest_shift(form, edit.by)
+    shift = form.nearest_shift(edit.by)
     if not bool(shift.any()):
         sizes = " × ".join(f"{side:g}" for side in form.lattice.size.tolist())
         raise DataError(f"by {','.join(f'{value:g}' for value in edit.by)} is less than half a cell of {sizes} m")
@@ -148,15 +149,6 @@ def _shifted(taken: Mapping[str, Tensor], form: MapForm, edit: Move | Copy) -> d
         raise DataError("it would reach out of all that a map can hold")
     origins = torch.full_like(taken[ORIGINS], CellOrigin.EDITED)
     return {**taken, CELLS: cells.to(taken[CELLS].dtype), ORIGINS: origins}
-
-
-def _nearest_shift(form: MapForm, by: Point) -> Int64[Tensor, " 3"]:
-    """Return by how many cells along each axis of the grid cells move that are told to by a vector, world metres."""
-    steps = (form.lattice.grid_from_world @ torch.tensor(by, dtype=torch.float64)) / form.lattice.size
-    shift: Int64[Tensor, " 3"] = steps.round().clamp(-2 * LIMIT, 2 * LIMIT).long()
-    if form.lattice.flat:
-        shift[form.height_axis] = 0
-    return shift
 
 
 def _joined(left: Mapping[str, Tensor], moved: Mapping[str, Tensor], overwrite: bool) -> dict[str, Tensor]:

@@ -21,9 +21,8 @@ from persist_cli.api.scene_edits import (
     Insert,
     Move,
     Paint,
-    Point,
     Remove,
-    last_vector,
+    last_moved,
 )
 from persist_cli.errors import DataError, hint
 from persist_memory.scene.support import free_below, standing_on
@@ -81,16 +80,8 @@ def edit_grid(
     filled = fill_from_surroundings(filled, hidden & ~filled.known)
     uncovered = int((~grid.known & (filled.origins == CellOrigin.IMAGINED)).sum())
     changed, by_whom = int(changes(grid, filled).sum()), _filled_by(uncovered, by_model)
-    return filled, EditOutcome(changed, uncovered, by_whom, _moved(grid, edits))
-
-
-def _moved(grid: CellGrid, edits: Sequence[Edit]) -> Point | None:
-    """How far the last edit that moves or copies took its cells, world metres."""
-    by = last_vector(edits)
-    if by is None:
-        return None
-    x, y, z = (grid.nearest_shift(by).double() * grid.form.size @ grid.axes).tolist()
-    return x, y, z
+    moved = last_moved(edits, lambda by: grid.nearest_shift(by).double() * grid.form.size @ grid.axes)
+    return filled, EditOutcome(changed, uncovered, by_whom, moved)
 
 
 def _filled_by(uncovered: int, by_model: int) -> FilledBy | None:
