@@ -19,7 +19,7 @@ from typing import Any, Final
 
 import yaml
 
-from persist_cli.api.checkpoint import PLAIN, find_checkpoint, step_folders
+from persist_cli.api.checkpoint import PLAIN, Checkpoint, find_checkpoint, step_folders
 from persist_cli.api.inference import InferenceOptions, SamplingOverrides
 from persist_cli.api.observations import Observations, TrajectoryInfo
 from persist_cli.api.simulator import Simulator
@@ -222,10 +222,15 @@ def identity(learning: Learning) -> dict[str, Any]:
     return dict(json.loads(json.dumps(values, default=str)))
 
 
+def chosen_model(plan: LearnPlan) -> tuple[Checkpoint, str | None]:
+    """Return the checkpoint inside which the policy practises, and its chosen adapter; ``None`` is for none."""
+    checkpoint = find_checkpoint(plan.checkpoint)
+    return checkpoint, checkpoint.chosen_adapter(plan.adapter)
+
+
 def model_identity(plan: LearnPlan) -> dict[str, Any]:
     """Return JSON values that tell models, and the adapters that are chosen of them, apart."""
-    checkpoint = find_checkpoint(plan.checkpoint)
-    adapter = checkpoint.chosen_adapter(plan.adapter)
+    checkpoint, adapter = chosen_model(plan)
     weights = weights_hash(checkpoint, adapter)
     return {"checkpoint": checkpoint.fingerprint, "adapter": {"name": adapter or PLAIN, "sha256": weights}}
 
@@ -236,9 +241,8 @@ def plugins_of(learning: Learning) -> list[tuple[str, str]]:
     if learning.simulator is not None:
         plugins.append(("simulator", learning.simulator.name))
     if plan.inside == MODEL:
-        checkpoint = find_checkpoint(plan.checkpoint)
+        checkpoint, adapter = chosen_model(plan)
         plugins.append(("backbone", checkpoint.backbone))
-        adapter = checkpoint.chosen_adapter(plan.adapter)
         if adapter is not None:
             plugins += adapter_plugins(checkpoint.adapter_folder(adapter))
     return plugins
@@ -301,8 +305,7 @@ def open_place(learning: Learning) -> PracticePlace:
     if plan.inside == SIMULATOR:
         assert learning.simulator is not None
         return TruePlace(learning.simulator, info)
-    checkpoint = find_checkpoint(plan.checkpoint)
-    adapter = checkpoint.chosen_adapter(plan.adapter)
+    checkpoint, adapter = chosen_model(plan)
     options = WorldOptions(
         start=plan.views[0], adapter=plan.adapter, seed=plan.seed, sampling=plan.sampling, placement=plan.placement,
         body=plan.body,

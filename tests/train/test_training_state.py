@@ -92,7 +92,7 @@ class Elsewhere(nn.Parameter):
 
 def test_an_average_follows_weights_on_another_device_as_slowly():
     here, away = (kind(torch.zeros(3)) for kind in (nn.Parameter, Elsewhere))
-    averages = [make_average([weight], TrainingSettings(ema=0.9)) for weight in (nn.Parameter(torch.zeros(3)), here)]
+    averages = [make_average([nn.Parameter(torch.zeros(3))], TrainingSettings(ema=0.9)) for _ in range(2)]
     for step in range(3):
         for weight, average in zip((here, away), averages, strict=True):
             weight.data.add_(step)
